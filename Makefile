@@ -1,0 +1,38 @@
+# Everything happens in .venv, which the first target called makes; no root, no system package.
+VENV := .venv
+BIN := $(VENV)/bin
+# pybullet has wheels for Python 3.10 and 3.11 only, so the first of these that runs is taken.
+PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
+	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' 2>/dev/null && echo $$p && break; done)
+
+.PHONY: demo test check bench bench-picks setup clean
+
+demo: setup
+	$(BIN)/robotcell pick --goal red
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: setup
+	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
+
+bench-picks: setup
+	$(BIN)/python -m tests.benchmarks.picks
+
+setup: $(VENV)/.installed
+
+$(VENV)/.installed: pyproject.toml
+	@test -n "$(PYTHON)" || { echo "robotcell needs Python 3.10 or 3.11 on PATH, or: make PYTHON=/path/to/python3.11"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[twin,dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache

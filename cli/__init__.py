@@ -1,0 +1,1 @@
+"""The `robotcell` command: parsing, progress and printing."""

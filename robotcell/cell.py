@@ -1,0 +1,70 @@
+"""A cell: its three devices, its clock and its configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from robotcell.config import CellConfig, find_backend
+from robotcell.errors import CellError, ConnectionLost, DeviceFault
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from robotcell.interfaces import Arm, Camera, Clock, Gripper
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The devices behind the interfaces. As a context manager it connects them all and closes them all."""
+
+    config: CellConfig
+    arm: Arm
+    gripper: Gripper
+    camera: Camera
+    clock: Clock
+
+    def __enter__(self) -> Cell:
+        """Connect every device, so that one attempt shows everything that is wrong.
+
+        Raises:
+            ConnectionLost, DeviceFault: the failure of the one device that failed, or all of them together
+                (as DeviceFault if every device could be reached).
+        """
+        failures: list[tuple[str, CellError]] = []
+        try:
+            for name, device in (("arm", self.arm), ("gripper", self.gripper), ("camera", self.camera)):
+                try:
+                    device.connect()
+                except CellError as error:
+                    failures.append((name, error))
+        except BaseException:
+            self.close()
+            raise
+        if failures:
+            self.close()
+            if len(failures) == 1:
+                raise failures[0][1]
+            kind = ConnectionLost if any(isinstance(e, ConnectionLost) for _, e in failures) else DeviceFault
+            raise kind("\n  ".join(["the cell cannot be opened:", *(f"{name}: {error}" for name, error in failures)]))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close every device; idempotent."""
+        self.camera.close()
+        self.gripper.close()
+        self.arm.close()
+
+
+def open_cell(config: CellConfig) -> Cell:
+    """The cell of a configuration, its devices not yet connected: use it in a `with` statement.
+
+    Raises:
+        ConfigError: its backend is not installed.
+    """
+    return find_backend(config.backend.name).open(config)

@@ -1,0 +1,306 @@
+"""`cell.toml`: one file that describes a cell, checked as a whole.
+
+With no file the twin with its defaults. Lengths in metres, angles in radians, base frame.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from robotcell import linkage
+from robotcell.errors import ConfigError
+from robotcell.geometry import Array, check_transform, look_at
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+    from robotcell.cell import Cell
+
+
+def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
+    if not interval[0] < interval[1]:
+        raise ValueError("the first number must be below the second")
+    return interval
+
+
+Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Positive = Annotated[float, Field(gt=0)]
+Vector3 = tuple[float, float, float]
+
+
+class _Table(BaseModel):
+    """A table of cell.toml: unknown keys are refused, numbers are finite, nothing changes after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Workspace(_Table):
+    """The rectangle of the table that the heightmap covers.
+
+    Rows run along base y, columns along base x; the centre of cell (row, col) is at
+    x = x_min + (col + 0.5) resolution, y = y_min + (row + 0.5) resolution.
+    """
+
+    x: Interval = (-0.724, -0.276)
+    y: Interval = (-0.224, 0.224)
+    resolution_m: Annotated[float, Field(ge=0.0005, le=0.01)] = 0.002
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the heightmap."""
+        rows, cols = ((b - a) / self.resolution_m for a, b in (self.y, self.x))
+        return max(1, round(rows)), max(1, round(cols))
+
+    def position(self, row: float, col: float) -> tuple[float, float]:
+        """(x, y) [m] of the centre of a cell."""
+        return self.x[0] + (col + 0.5) * self.resolution_m, self.y[0] + (row + 0.5) * self.resolution_m
+
+    def cell(self, x: float, y: float) -> tuple[int, int]:
+        """(row, col) of the cell that contains a point [m]; outside the heightmap if the point is."""
+        return (
+            int(np.floor((y - self.y[0]) / self.resolution_m)),
+            int(np.floor((x - self.x[0]) / self.resolution_m)),
+        )
+
+
+class Table(_Table):
+    """The table top: the plane z = height_m."""
+
+    height_m: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+
+
+class Bin(_Table):
+    """The box that picked objects are dropped into."""
+
+    center: tuple[float, float] = (-0.30, 0.45)
+    size: tuple[Positive, Positive] = (0.36, 0.30)
+    wall_height_m: Annotated[float, Field(gt=0, le=0.5)] = 0.10
+
+
+class KeepOut(_Table):
+    """A box that no part of arm, gripper or load may enter."""
+
+    name: str
+    x: Interval
+    y: Interval
+    z: Interval
+
+
+class Motion(_Table):
+    """How the arm moves. Speeds are those of the leading joint and of the tcp."""
+
+    home_q: tuple[float, float, float, float, float, float] = (-0.75, -1.90, 1.75, -1.42, -1.5708, 0.0)
+    joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 1.5
+    # Universal Robots' default for movej.
+    joint_acceleration_rad_s2: Annotated[float, Field(gt=0, le=40)] = 1.4
+    linear_speed_m_s: Annotated[float, Field(gt=0, le=1)] = 0.25
+    # Universal Robots' default for movel.
+    linear_acceleration_m_s2: Annotated[float, Field(gt=0, le=10)] = 1.2
+    guarded_speed_m_s: Annotated[float, Field(gt=0, le=0.25)] = 0.10
+    approach_m: Annotated[float, Field(ge=0.02, le=0.4)] = 0.15
+    push_m: Annotated[float, Field(ge=0.01, le=0.3)] = 0.10
+    # A guarded descent that meets this force has met an object: it ends, and the grasp is given up.
+    contact_force_n: Annotated[float, Field(gt=0, le=100)] = 30.0
+
+
+class Limits(_Table):
+    """What the safety layer allows. It adds to the controller's own safety settings and never replaces them."""
+
+    # The tcp stays inside this box (the workspace, the bin and the way between them).
+    x: Interval = (-0.80, 0.20)
+    y: Interval = (-0.45, 0.65)
+    z: Interval = (0.0, 0.70)
+    joint_margin_rad: Annotated[float, Field(ge=0, le=1)] = 0.05
+    joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 2.0
+    tool_speed_m_s: Annotated[float, Field(gt=0, le=3)] = 1.5
+    # Below the 150 N at which a UR5e's factory safety preset stops the arm.
+    force_n: Annotated[float, Field(gt=0, le=250)] = 100.0
+    # Smallest singular value of the Jacobian.
+    singularity: Annotated[float, Field(ge=0, le=0.2)] = 0.02
+    # Distance that arm and gripper keep from keep-outs and from themselves.
+    clearance_m: Annotated[float, Field(ge=0, le=0.1)] = 0.005
+    state_age_s: Annotated[float, Field(gt=0, le=1)] = 0.1
+    frame_age_s: Annotated[float, Field(gt=0, le=5)] = 1.0
+    min_coverage: Annotated[float, Field(ge=0, le=1)] = 0.6
+    max_tilt_rad: Annotated[float, Field(gt=0, le=0.2)] = 0.02
+    max_table_offset_m: Annotated[float, Field(gt=0, le=0.05)] = 0.006
+
+
+class CameraMount(_Table):
+    """The fixed camera: its mode, and where it stands, by two points or by a transform."""
+
+    resolution: Annotated[str, Field(pattern="^(640x480|1280x720)$")] = "640x480"
+    position: Vector3 = (-0.948, 0.0, 0.746)
+    look_at: Vector3 = (-0.5, 0.0, 0.0)
+    # T_base_camera, rows of a 4x4 matrix; stands above the two points when given.
+    T_base_camera: tuple[tuple[float, ...], ...] | None = None
+
+    @model_validator(mode="after")
+    def _is_a_pose(self) -> CameraMount:
+        self.pose()
+        return self
+
+    def pose(self) -> Array:
+        """T_base_camera (4, 4)."""
+        if self.T_base_camera is not None:
+            return check_transform(self.T_base_camera, "T_base_camera")
+        return look_at(self.position, self.look_at)
+
+
+class GripperUse(_Table):
+    """How the gripper is used."""
+
+    force_n: Annotated[float, Field(ge=linkage.MIN_FORCE_N, le=linkage.MAX_FORCE_N)] = 40.0
+    # Narrower than the stroke: wide-open fingers collide with neighbours, and their tips draw back by 40 mm.
+    preshape_m: Annotated[float, Field(gt=0, le=linkage.MAX_WIDTH_M)] = 0.080
+    # Fingers closer than this hold nothing.
+    empty_width_m: Annotated[float, Field(gt=0, le=0.05)] = 0.005
+    # The finger tips stay this far above the table.
+    tip_clearance_m: Annotated[float, Field(ge=0.001, le=0.05)] = 0.003
+
+
+class PolicyChoice(_Table):
+    """Which policy decides."""
+
+    name: str = "heuristic"
+
+
+class JournalPlace(_Table):
+    """Where jobs are recorded."""
+
+    # Any SQLAlchemy URL; by default a SQLite file in the folder of the runs.
+    url: str | None = None
+    runs: Path = Path("runs")
+
+    def database_url(self) -> str:
+        """The SQLAlchemy URL of the journal."""
+        return self.url or f"sqlite:///{self.runs / 'journal.db'}"
+
+
+class BackendChoice(_Table):
+    """Which devices stand behind the interfaces; the backend itself checks its options."""
+
+    name: str = "twin"
+    options: dict[str, Any] = {}
+
+
+class CellConfig(_Table):
+    """A whole cell."""
+
+    workspace: Workspace = Workspace()
+    table: Table = Table()
+    bin: Bin = Bin()
+    keep_out: tuple[KeepOut, ...] = ()
+    motion: Motion = Motion()
+    limits: Limits = Limits()
+    camera: CameraMount = CameraMount()
+    gripper: GripperUse = GripperUse()
+    policy: PolicyChoice = PolicyChoice()
+    journal: JournalPlace = JournalPlace()
+    backend: BackendChoice = BackendChoice()
+
+
+class Backend(Protocol):
+    """An entry point of the group `robotcell.backends`: a class with these two members."""
+
+    Options: type[BaseModel]
+
+    @staticmethod
+    def open(config: CellConfig) -> Cell:
+        """The cell's devices, not yet connected; `config.backend.options` fits `Options`."""
+        ...
+
+
+def find_backend(name: str) -> Backend:
+    """The backend of that name.
+
+    Raises:
+        ConfigError: there is none, or it cannot be imported; the message lists those that are installed.
+    """
+    installed = {entry.name: entry for entry in entry_points(group="robotcell.backends")}
+    if name not in installed:
+        raise ConfigError(f"no backend is called {name!r}; installed: {', '.join(sorted(installed)) or 'none'}")
+    try:
+        backend: Backend = installed[name].load()
+    except ImportError as error:
+        raise ConfigError(
+            f"backend {name!r} cannot be imported ({error}); install its extra, for the twin: "
+            "pip install 'robotcell[twin]'"
+        ) from error
+    return backend
+
+
+def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> CellConfig:
+    """Read and check a cell file.
+
+    Args:
+        path: a TOML file; None for the twin with its defaults.
+        overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
+
+    Raises:
+        ConfigError: naming every bad key at once, each with its value and what is allowed.
+    """
+    values = _read_toml(path) if path else {}
+    for key, value in (overrides or {}).items():
+        _set(values, key, value)
+    problems: list[str] = []
+    config = None
+    try:
+        config = CellConfig.model_validate(values)
+    except ValidationError as error:
+        problems += [_describe(detail, ()) for detail in error.errors()]
+    backend_table = values.get("backend", {})
+    if isinstance(backend_table, dict):
+        try:
+            backend = find_backend(str(backend_table.get("name", BackendChoice().name)))
+            backend.Options.model_validate(backend_table.get("options", {}))
+        except ConfigError as error:
+            problems.append(f"backend.name: {error}")
+        except ValidationError as error:
+            problems += [_describe(detail, ("backend", "options")) for detail in error.errors()]
+    if config is None or problems:
+        place = str(path) if path else "the cell's settings"
+        raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
+    return config
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from examples/cell.toml") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+
+
+def _set(values: dict[str, Any], dotted_key: str, value: object) -> None:
+    *tables, key = dotted_key.split(".")
+    for table in tables:
+        inner = values.setdefault(table, {})
+        if not isinstance(inner, dict):
+            return  # the file holds something else there, which the validation reports
+        values = inner
+    values[key] = value
+
+
+def _describe(detail: ErrorDetails, prefix: tuple[str, ...]) -> str:
+    key = ".".join(str(part) for part in (*prefix, *detail["loc"]))
+    if detail["type"] == "extra_forbidden":
+        return f"{key} = {detail['input']!r}: unknown key; see docs/configuration.md for those that exist"
+    if detail["type"] == "missing":
+        return f"{key}: missing"
+    return f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}"

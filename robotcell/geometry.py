@@ -1,0 +1,108 @@
+"""Rigid transforms and angles.
+
+`T_a_b` is a (4, 4) float64 matrix that maps points in frame b to frame a (the pose of b in a). Metres, radians.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+# How far R R^T may be from the identity; single-precision files and printed digits stay below it.
+_ROTATION_TOLERANCE = 1e-4
+
+
+def make_transform(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Array:
+    """The (4, 4) transform of a (3, 3) rotation matrix and a (3,) translation [m]."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation
+    return T
+
+
+def check_transform(T: npt.ArrayLike, name: str) -> Array:
+    """Return `T` as a (4, 4) float64 array if it is a right-handed rigid transform.
+
+    Raises:
+        ValueError: naming the transform and what is wrong with it.
+    """
+    matrix = np.asarray(T, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"{name} has shape {matrix.shape}; a 4x4 matrix is needed")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{name} contains NaN or infinity")
+    if not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise ValueError(f"{name} has the last row {matrix[3].tolist()}; it must be 0 0 0 1")
+    R = matrix[:3, :3]
+    if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE):
+        raise ValueError(f"{name} is not rigid: its rotation part is not orthonormal")
+    if np.linalg.det(R) < 0:
+        raise ValueError(f"{name} is mirrored: its rotation part has determinant -1")
+    return matrix
+
+
+def invert_transform(T: Array) -> Array:
+    """`T_b_a` from `T_a_b`."""
+    R = T[:3, :3]
+    return make_transform(R.T, -R.T @ T[:3, 3])
+
+
+def transform_points(T_a_b: Array, points_b: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Map (..., 3) points in frame b to frame a [m]."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def rotation_z(angle: float) -> Array:
+    """The (3, 3) rotation by `angle` [rad] about z."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotvec_to_matrix(rotvec: npt.ArrayLike) -> Array:
+    """The (3, 3) rotation matrix of a (3,) rotation vector [rad]."""
+    return np.asarray(Rotation.from_rotvec(np.asarray(rotvec, dtype=np.float64)).as_matrix())
+
+
+def matrix_to_rotvec(rotation: Array) -> Array:
+    """The (3,) rotation vector [rad] of a (3, 3) rotation matrix."""
+    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+
+
+def rotation_angle(R_a: Array, R_b: Array) -> float:
+    """The angle [rad] of the rotation between two (3, 3) rotation matrices."""
+    return float(np.linalg.norm(matrix_to_rotvec(R_a.T @ R_b)))
+
+
+def interpolate_transforms(T_start: Array, T_end: Array, fractions: npt.ArrayLike) -> Array:
+    """Transforms (N, 4, 4) on the straight line, with slerp for the rotation, at (N,) fractions in [0, 1]."""
+    s = np.atleast_1d(np.asarray(fractions, dtype=np.float64))
+    T = np.tile(np.eye(4), (len(s), 1, 1))
+    T[:, :3, 3] = T_start[:3, 3] + s[:, None] * (T_end[:3, 3] - T_start[:3, 3])
+    T[:, :3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix([T_start[:3, :3], T_end[:3, :3]]))(s).as_matrix()
+    return T
+
+
+def look_at(eye: npt.ArrayLike, target: npt.ArrayLike) -> Array:
+    """`T_base_camera` (OpenCV axes: x right, y down, z forward) of a camera at `eye` that looks at `target` [m].
+
+    The image's up direction is base +z, or base +x when the camera looks straight up or down.
+
+    Raises:
+        ValueError: if eye and target coincide.
+    """
+    eye, target = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    forward = target - eye
+    distance = np.linalg.norm(forward)
+    if distance < 1e-9:
+        raise ValueError("the camera's position and the point it looks at coincide")
+    forward = forward / distance
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 1 - 1e-9 else np.array([1.0, 0.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    return make_transform(np.column_stack([right, down, forward]), eye)

@@ -1,0 +1,1 @@
+"""The twin: the cell's devices over a pybullet world."""
