@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.config import CellConfig
     from robotcell.decision import Policy
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -16,26 +15,30 @@ import numpy.typing as npt
 from robotcell.geometry import Array, check_transform, invert_transform, transform_points
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from robotcell.config import Workspace
     from robotcell.interfaces import Intrinsics, RgbdFrame
 
-# Returns outside this band above the table [m] are not of things that lie on it: the arm, a lamp, reflections in the
-# table top. The upper end is the height up to which the paper counts a cell as occupied (30 cm); the lower one leaves
-# room for the largest table offset that a configuration may allow (5 cm).
+# Returns outside this band above the table [m] are not of things that lie on it: the arm, a lamp, reflections
+# in the table top. The upper end is the height up to which the paper counts a cell as occupied (30 cm); the
+# lower one leaves room for the largest table offset that a configuration may allow (5 cm).
 BAND_M = (-0.10, 0.30)
 
-# `Heightmap.filled` closes holes from their rims by this many cells: 6 mm at 2 mm resolution, the gaps that depth
+# `Heightmap.filled` closes holes from their rims by this many cells: 6 mm at 2 mm resolution, the gaps that
 # drop-out and an oblique view leave, and less than the shadow of the lowest block (25 mm high, 15 mm shadow).
 _FILL_CELLS = 3
 
-# The table is sought among the returns of this many at most, regularly spaced: 0.1 mm of standard error at 10 mm noise.
+# The table is sought among about this many returns, regularly spaced: enough for a tenth of a millimetre.
 _TABLE_SAMPLES = 20_000
-# Bins of the search for the table's level; then the distances to the plane within which it is fitted, coarse to fine.
-# The last is three standard deviations of a D415's depth noise at 1 m (2 mm, datasheet: 2 % at 2 m as an upper bound).
+# Bins of the search for the table's level; then the distances to the plane within which it is fitted, from
+# coarse to fine. The last is three times the depth noise of a D415 at 1 m (about 2 mm).
 _TABLE_BIN_M = 0.004
 _TABLE_BAND_M = (0.015, 0.010, 0.006)
 # Below this share of the workspace, what looks like table may be an object's top.
 _TABLE_SHARE = 0.10
+
+_Value = TypeVar("_Value", bound=np.generic)
 
 
 @dataclass(frozen=True)
@@ -60,8 +63,8 @@ class Heightmap:
     Attributes:
         workspace: the rectangle, and from it the position of each cell.
         color: (H, W, 3) uint8 RGB of the highest return of each cell; black where none fell.
-        height_m: (H, W) float32, the highest return of each cell above the configured table height [m]; NaN = never
-            seen.
+        height_m: (H, W) float32, the highest return of each cell above the configured table height [m];
+            NaN = never seen.
         table: the table as it was measured; None when too little of it is seen.
         coverage: share of cells that were seen, 0..1.
         masks: (H, W) bool by name: the image masks at the highest return of each cell; False where none fell.
@@ -79,17 +82,18 @@ class Heightmap:
     def filled(self) -> npt.NDArray[np.float32]:
         """The heights (H, W) [m] without NaN, for what cannot work with unknown cells.
 
-        A hole takes the highest of its neighbours, 3x3, from its rim inwards by three cells: small holes close at
-        the height of what surrounds them and objects do not shrink. What is still unknown (the shadow behind an object,
-        the world beyond the image) takes the table's level 0, the only value that does not invent an object. Whoever
-        plans a motion must therefore ask `height_m` whether a cell was seen at all.
+        A hole takes the highest of its neighbours, 3x3, from its rim inwards by three cells: small holes
+        close at the height of what surrounds them and objects do not shrink. What is still unknown (the
+        shadow behind an object, the world beyond the image) takes the table's level 0, the only value that
+        does not invent an object. Whoever plans a motion must therefore ask `height_m` whether a cell was
+        seen at all.
         """
         heights = grow_into_unknown(self.height_m, _FILL_CELLS)
         return np.nan_to_num(heights, copy=False, nan=0.0)
 
 
 def grow_into_unknown(height_m: npt.NDArray[np.float32], cells: int) -> npt.NDArray[np.float32]:
-    """A copy of (H, W) heights in which each NaN takes the highest of its 3x3 neighbours, repeated `cells` times."""
+    """A copy of (H, W) heights whose NaN take the highest of their 3x3 neighbours, `cells` times over."""
     unknown = np.isnan(height_m)
     lowest = np.float32(-np.inf)
     heights = np.where(unknown, lowest, height_m)
@@ -110,8 +114,8 @@ def build_heightmap(
 ) -> Heightmap:
     """Project a frame along gravity: each cell takes the height, colour and masks of its highest return.
 
-    Returns lower than 10 cm below the table or higher than 30 cm above it are left out (`BAND_M`); under an arm that
-    reaches into the view the table is therefore unknown, not high.
+    Returns lower than 10 cm below the table or higher than 30 cm above it are left out (`BAND_M`); under an
+    arm that reaches into the view the table is therefore unknown, not high.
 
     Args:
         frame: colour and registered depth.
@@ -124,7 +128,8 @@ def build_heightmap(
         ValueError: the transform is not rigid, or an image does not have the size that the intrinsics say.
     """
     size = (frame.intrinsics.height, frame.intrinsics.width)
-    for name, image in (("color", frame.color), ("depth_m", frame.depth_m), *masks.items()):
+    images: dict[str, npt.NDArray[Any]] = {"color": frame.color, "depth_m": frame.depth_m, **masks}
+    for name, image in images.items():
         if image.shape[:2] != size:
             raise ValueError(
                 f"image {name!r} is {image.shape[:2]}; the intrinsics say {size} (height, width)"
@@ -143,7 +148,7 @@ def build_heightmap(
     pixel = np.flatnonzero(inside)
     col, row, height = col.ravel()[pixel], row.ravel()[pixel], height.ravel()[pixel]
 
-    # The bits of a positive float32 order as the float does, so one integer maximum finds the height and the pixel.
+    # The bits of a positive float32 order as the float does: one integer maximum finds height and pixel.
     order = (height - np.float32(2 * BAND_M[0])).view(np.int32).astype(np.int64)
     highest = np.full(rows * cols, -1, np.int64)
     np.maximum.at(
@@ -158,7 +163,7 @@ def build_heightmap(
     heights[seen] = height[point]
     image_row, image_col = np.divmod(pixel[point], depth.shape[1]) if depth.size else (point, point)
 
-    def carried(image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
+    def carried(image: npt.NDArray[_Value]) -> npt.NDArray[_Value]:
         values = np.zeros((rows * cols, *image.shape[2:]), image.dtype)
         values[seen] = image[view.crop][image_row, image_col]
         return values.reshape(rows, cols, *image.shape[2:])
