@@ -1,0 +1,142 @@
+"""A model of arm, gripper and obstacles that is coarse, conservative and fast: spheres against boxes.
+
+Each link is a chain of spheres along its axis, in the frames of `kinematics.link_frames`. Radii cover the housings of
+the UR5e (joint housings 120 to 150 mm, upper arm 110 mm, forearm 90 mm and wrists 90 mm across) and of the RG2's body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from robotcell import kinematics, linkage
+from robotcell.config import CellConfig, KeepOut
+from robotcell.geometry import Array
+
+# Distance of the upper arm's tube from the plane of the base, along the shoulder axis (UR5e drawing: 0.138 m).
+_UPPER_ARM_OFFSET_M = 0.138
+_SPACING_M = 0.03
+# Palm of the RG2, from the flange (its pivots are 126 mm from it).
+_PALM_M = 0.128
+# The camera's housing and its post stand behind its optical centre.
+_CAMERA_HALF_M = 0.06
+_POST_HALF_M = 0.03
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """Spheres fixed to links.
+
+    Attributes:
+        link: (N,) index of the frame that carries each sphere, 0 base .. 6 flange.
+        center: (N, 3) in that frame [m].
+        radius: (N,) [m].
+        group: (N,) index of the body that it belongs to, in order from the base.
+    """
+
+    link: npt.NDArray[np.int64]
+    center: Array
+    radius: Array
+    group: npt.NDArray[np.int64]
+
+
+# (frame, start, end, radius) of each body in order from the base.
+_BODIES = (
+    (0, (0.0, 0.0, 0.03), (0.0, 0.0, 0.1625), 0.075),
+    (1, (0.0, 0.0, 0.0), (0.0, 0.0, _UPPER_ARM_OFFSET_M), 0.070),
+    (2, (0.425, 0.0, _UPPER_ARM_OFFSET_M), (0.0, 0.0, _UPPER_ARM_OFFSET_M), 0.060),
+    (3, (0.3922, 0.0, 0.015), (0.0, 0.0, 0.015), 0.055),
+    (4, (0.0, -0.1333, 0.0), (0.0, 0.0, 0.0), 0.050),
+    (5, (0.0, 0.0997, 0.0), (0.0, 0.0, 0.0), 0.048),
+    (6, (0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 0.045),
+    (6, (0.0, 0.0, 0.05), (0.0, 0.0, _PALM_M), 0.055),
+)
+_GRIPPER = len(_BODIES) - 1
+# Bodies this many places apart in the chain share a joint housing or a neighbour's, and cannot touch.
+_NEIGHBOURS = 2
+
+
+def robot_spheres() -> Spheres:
+    """The spheres of arm and gripper body, without the fingers (their tips are checked as the tcp)."""
+    link, center, radius, group = [], [], [], []
+    for index, (frame, start, end, r) in enumerate(_BODIES):
+        length = float(np.linalg.norm(np.subtract(end, start)))
+        for s in np.linspace(0.0, 1.0, max(2, int(np.ceil(length / _SPACING_M)) + 1)):
+            link.append(frame)
+            center.append((1 - s) * np.array(start) + s * np.array(end))
+            radius.append(r)
+            group.append(index)
+    return Spheres(np.array(link), np.array(center), np.array(radius), np.array(group))
+
+
+SPHERES = robot_spheres()
+
+
+def sphere_centers(q: npt.ArrayLike) -> Array:
+    """Centres (..., N, 3) of `SPHERES` in the base frame [m] at joint angles (..., 6)."""
+    frames = kinematics.link_frames(q)[..., SPHERES.link, :, :]
+    return np.einsum("...nij,nj->...ni", frames[..., :3, :3], SPHERES.center) + frames[..., :3, 3]
+
+
+def obstacles(config: CellConfig) -> tuple[KeepOut, ...]:
+    """Everything that arm and gripper must not enter: the keep-outs of the file, the bin, the camera and its post."""
+    table = config.table.height_m
+    (bx, by), (sx, sy) = config.bin.center, config.bin.size
+    bin_box = KeepOut(
+        name="bin",
+        x=(bx - sx / 2, bx + sx / 2),
+        y=(by - sy / 2, by + sy / 2),
+        z=(table, table + config.bin.wall_height_m),
+    )
+    T = config.camera.pose()
+    x, y, z = T[:3, 3]
+    camera = KeepOut(
+        name="camera",
+        x=(x - _CAMERA_HALF_M, x + _CAMERA_HALF_M),
+        y=(y - _CAMERA_HALF_M, y + _CAMERA_HALF_M),
+        z=(z - _CAMERA_HALF_M, z + _CAMERA_HALF_M),
+    )
+    # The post stands on the side that the camera does not look at.
+    away = -T[:2, 2] / max(float(np.linalg.norm(T[:2, 2])), 1e-9)
+    px, py = np.array([x, y]) + (_CAMERA_HALF_M + _POST_HALF_M) * away
+    post = KeepOut(
+        name="camera post",
+        x=(px - _POST_HALF_M, px + _POST_HALF_M),
+        y=(py - _POST_HALF_M, py + _POST_HALF_M),
+        z=(min(table, z) - _POST_HALF_M, max(table, z) + _CAMERA_HALF_M),
+    )
+    return (*config.keep_out, bin_box, camera, post)
+
+
+def box_distance(box: KeepOut, points: Array) -> npt.NDArray[np.float64]:
+    """Distance [m] of points (..., 3) from a box; 0 inside."""
+    low, high = np.array([box.x, box.y, box.z]).T
+    return np.asarray(np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=-1))
+
+
+def self_distance(centers: Array) -> npt.NDArray[np.float64]:
+    """Smallest gap (...,) [m] between bodies that are not neighbours, of sphere centres (..., N, 3)."""
+    return np.asarray(
+        (
+            np.linalg.norm(centers[..., _PAIRS[0], :] - centers[..., _PAIRS[1], :], axis=-1)
+            - (SPHERES.radius[_PAIRS[0]] + SPHERES.radius[_PAIRS[1]])
+        ).min(axis=-1)
+    )
+
+
+def finger_points(T_base_tcp: Array, load_m: float) -> Array:
+    """Points (..., K, 3) [m] that stand for the open fingers and for a load that reaches `load_m` below the tcp."""
+    half = linkage.MAX_WIDTH_M / 2 + linkage.FINGER_THICKNESS_M
+    tips = np.array([(side * half, 0.0, z) for side in (-1, 0, 1) for z in (-0.06, -0.03, load_m)])
+    return np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], tips) + T_base_tcp[..., None, :3, 3]
+
+
+def _sphere_pairs() -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    i, j = np.triu_indices(len(SPHERES.group), k=1)
+    apart = SPHERES.group[j] - SPHERES.group[i] > _NEIGHBOURS
+    return i[apart], j[apart]
+
+
+_PAIRS = _sphere_pairs()

@@ -1,0 +1,260 @@
+"""From an action to a motion plan: what the arm and the gripper will do, step by step.
+
+A plan is data. Nothing here moves, and nothing here decides whether the plan is safe: `safety.check_plan` does.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from robotcell import kinematics, linkage
+from robotcell.decision import Action, Primitive
+from robotcell.errors import UnsafeMotion
+from robotcell.geometry import Array, invert_transform, make_transform
+
+if TYPE_CHECKING:
+    from robotcell.config import CellConfig
+    from robotcell.heightmap import Heightmap
+    from robotcell.interfaces import ArmState
+
+# The tcp: between the tips of the closed fingers, axes of the flange. The fingers close along its x axis.
+T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, linkage.CLOSED_LENGTH_M))
+
+# Paper, section "Evaluation" of the released code: the finger tips go 4 cm below the surface at the chosen pixel.
+GRASP_DEPTH_M = 0.040
+# A load gripped 4 cm below its top reaches at most this far below the tcp (the tallest block is 100 mm).
+LOAD_REACH_M = 0.060
+# The unguarded part of a descent ends this far above the highest thing under the open gripper.
+_NEAR_M = 0.020
+# Finger tips pass this high over the walls of the bin with a load.
+_BIN_CLEARANCE_M = 0.12
+# A push shorter than this, after it was clamped to the workspace, moves nothing.
+_MIN_PUSH_M = 0.02
+
+
+@dataclass(frozen=True)
+class JointMove:
+    """A joint-space motion to q (6,) [rad]; `load_m` is how far a held object reaches below the tcp."""
+
+    label: str
+    q: Array
+    speed_rad_s: float
+    acceleration_rad_s2: float
+    load_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class LinearMove:
+    """A straight motion of the tcp to `T_base_tcp`.
+
+    With `contact_force_n` the motion is guarded: that force ends the plan with `Ending.CONTACT`.
+    """
+
+    label: str
+    T_base_tcp: Array
+    speed_m_s: float
+    acceleration_m_s2: float
+    contact_force_n: float | None = None
+    load_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A motion of the fingers, waited for."""
+
+    label: str
+    width_m: float
+    force_n: float
+
+
+@dataclass(frozen=True)
+class CheckHold:
+    """Ends the plan with `Ending.EMPTY` unless the fingers hold something at least this wide."""
+
+    label: str
+    min_width_m: float
+
+
+Step: TypeAlias = JointMove | LinearMove | Grip | CheckHold
+
+
+@dataclass(frozen=True)
+class MotionPlan:
+    """Steps that start from the joint angles `q_start` (6,) [rad]."""
+
+    label: str
+    q_start: Array
+    steps: tuple[Step, ...]
+
+
+def tool_down(x: float, y: float, z: float, theta: float) -> Array:
+    """T_base_tcp (4, 4) of a tool that points straight down and closes along (cos theta, sin theta)."""
+    c, s = math.cos(theta), math.sin(theta)
+    return make_transform([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]], (x, y, z))
+
+
+def flange_pose(T_base_tcp: Array) -> Array:
+    """T_base_flange (..., 4, 4) of tcp poses."""
+    return T_base_tcp @ invert_transform(T_FLANGE_TCP)
+
+
+def plan_action(action: Action, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
+    """The motion of a grasp or a push, from `q_start` back to the home pose.
+
+    Raises:
+        UnsafeMotion: a pose is out of reach, or nothing is left of a push inside the workspace.
+    """
+    if action.primitive is Primitive.GRASP:
+        return _plan_grasp(action, heightmap, q_start, config)
+    return _plan_push(action, heightmap, q_start, config)
+
+
+def plan_retreat(state: ArmState, config: CellConfig) -> MotionPlan:
+    """Straight up to the approach height, open the fingers, go home: from wherever the arm stands."""
+    x, y, z = state.T_base_tcp[:3, 3]
+    clear_z = config.table.height_m + config.motion.approach_m + GRASP_DEPTH_M
+    steps: list[Step] = []
+    if z < clear_z:
+        T_up = state.T_base_tcp.copy()
+        T_up[2, 3] = clear_z
+        steps.append(_linear("retreat", T_up, config))
+    steps.append(Grip("open", config.gripper.preshape_m, config.gripper.force_n))
+    steps.append(_home(config))
+    return MotionPlan("retreat", state.q, tuple(steps))
+
+
+def push_segment(action: Action, config: CellConfig) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Start and end (x, y) [m] of a push, clamped to the workspace."""
+    x, y, _ = action.xyz
+    workspace, length = config.workspace, config.motion.push_m
+    end_x, end_y = x + length * math.cos(action.theta), y + length * math.sin(action.theta)
+    return _clamp(x, y, workspace.x, workspace.y), _clamp(end_x, end_y, workspace.x, workspace.y)
+
+
+def grasp_height(surface_m: float, config: CellConfig) -> float:
+    """Height of the tcp above the table [m] for a grasp at a surface that high."""
+    return max(surface_m - GRASP_DEPTH_M, config.gripper.tip_clearance_m)
+
+
+def push_height(surface_m: float, config: CellConfig) -> float:
+    """Height of the tcp above the table [m] for a push of a surface that high: half of it (paper)."""
+    return max(surface_m / 2, config.gripper.tip_clearance_m)
+
+
+def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
+    table, use, motion = config.table.height_m, config.gripper, config.motion
+    x, y, z = action.xyz
+    tcp_z = table + grasp_height(z - table, config)
+    approach_z = tcp_z + motion.approach_m
+    theta = action.theta
+    q_above = _solve("approach", tool_down(x, y, approach_z, theta), config)
+    # The symmetric jaw may have been turned by half a turn to stay near the home pose.
+    T_above = kinematics.forward(q_above) @ T_FLANGE_TCP
+    T_near, T_grasp = T_above.copy(), T_above.copy()
+    highest = table + _highest_under_gripper(heightmap, x, y)
+    T_near[2, 3] = float(np.clip(highest + _NEAR_M - linkage.tip_retraction(use.preshape_m), tcp_z, approach_z))
+    T_grasp[2, 3] = tcp_z
+    bin_x, bin_y = config.bin.center
+    bin_z = table + config.bin.wall_height_m + _BIN_CLEARANCE_M
+    q_bin = _solve("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
+    steps: tuple[Step, ...] = (
+        Grip("pre-shape", use.preshape_m, use.force_n),
+        _joint("approach", q_above, config),
+        _linear("descend", T_near, config),
+        LinearMove(
+            "descend guarded",
+            T_grasp,
+            motion.guarded_speed_m_s,
+            motion.linear_acceleration_m_s2,
+            contact_force_n=motion.contact_force_n,
+        ),
+        Grip("close", linkage.MIN_WIDTH_M, use.force_n),
+        LinearMove(
+            "lift", T_above, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M
+        ),
+        CheckHold("held after the lift", use.empty_width_m),
+        _joint("carry to bin", q_bin, config, load_m=LOAD_REACH_M),
+        CheckHold("held over the bin", use.empty_width_m),
+        Grip("release", use.preshape_m, use.force_n),
+        _home(config),
+    )
+    return MotionPlan("grasp", q_start, steps)
+
+
+def _plan_push(action: Action, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
+    table, motion = config.table.height_m, config.motion
+    (x, y), (end_x, end_y) = push_segment(action, config)
+    if math.hypot(end_x - x, end_y - y) < _MIN_PUSH_M:
+        raise UnsafeMotion(
+            f"push at x {x:.3f}, y {y:.3f} m: less than {1000 * _MIN_PUSH_M:.0f} mm of it is inside the workspace"
+        )
+    tcp_z = table + push_height(action.xyz[2] - table, config)
+    approach_z = tcp_z + motion.approach_m
+    q_above = _solve("approach", tool_down(x, y, approach_z, action.theta), config)
+    T_above = kinematics.forward(q_above) @ T_FLANGE_TCP
+    T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
+    highest = table + _highest_under_gripper(heightmap, x, y)
+    T_near[2, 3] = float(np.clip(highest + _NEAR_M, tcp_z, approach_z))
+    T_start[2, 3] = tcp_z
+    T_end[:3, 3] = (end_x, end_y, tcp_z)
+    T_up[:3, 3] = (end_x, end_y, approach_z)
+    guarded = {
+        "speed_m_s": motion.guarded_speed_m_s,
+        "acceleration_m_s2": motion.linear_acceleration_m_s2,
+        "contact_force_n": motion.contact_force_n,
+    }
+    steps: tuple[Step, ...] = (
+        Grip("close", linkage.MIN_WIDTH_M, config.gripper.force_n),
+        _joint("approach", q_above, config),
+        _linear("descend", T_near, config),
+        LinearMove("descend guarded", T_start, **guarded),
+        LinearMove("push", T_end, **guarded),
+        _linear("lift", T_up, config),
+        _home(config),
+    )
+    return MotionPlan("push", q_start, steps)
+
+
+def _highest_under_gripper(heightmap: Heightmap, x: float, y: float) -> float:
+    """The highest seen cell [m above the table] under the open gripper, turned any way; 0 if none was seen."""
+    workspace = heightmap.workspace
+    radius = linkage.MAX_WIDTH_M / 2 + linkage.FINGER_THICKNESS_M
+    row, col = workspace.cell(x, y)
+    reach = math.ceil(radius / workspace.resolution_m)
+    rows, cols = workspace.shape
+    window = heightmap.height_m[
+        max(0, row - reach) : min(rows, row + reach + 1), max(0, col - reach) : min(cols, col + reach + 1)
+    ]
+    seen = window[np.isfinite(window)]
+    return max(0.0, float(seen.max())) if seen.size else 0.0
+
+
+def _solve(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
+    """Joint angles nearest to the home pose; the jaw is symmetric, so half a turn about its axis is as good."""
+    home = np.array(config.motion.home_q)
+    poses = (T_base_tcp, T_base_tcp @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    solutions = [q for T in poses if (q := kinematics.inverse(flange_pose(T), home)) is not None]
+    if not solutions:
+        x, y, z = T_base_tcp[:3, 3]
+        raise UnsafeMotion(f"{label}: the arm cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with the tool down")
+    return min(solutions, key=lambda q: float(np.abs(q - home).max()))
+
+
+def _joint(label: str, q: Array, config: CellConfig, load_m: float = 0.0) -> JointMove:
+    return JointMove(label, q, config.motion.joint_speed_rad_s, config.motion.joint_acceleration_rad_s2, load_m)
+
+
+def _linear(label: str, T_base_tcp: Array, config: CellConfig) -> LinearMove:
+    return LinearMove(label, T_base_tcp, config.motion.linear_speed_m_s, config.motion.linear_acceleration_m_s2)
+
+
+def _home(config: CellConfig) -> JointMove:
+    return _joint("home", np.array(config.motion.home_q), config)
+
+
+def _clamp(x: float, y: float, x_range: tuple[float, float], y_range: tuple[float, float]) -> tuple[float, float]:
+    return min(max(x, x_range[0]), x_range[1]), min(max(y, y_range[0]), y_range[1])
