@@ -1,0 +1,175 @@
+"""What a pinhole camera at a fixed place sees of a list of meshes: one ray per pixel, cast by Open3D (Embree)."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import importlib
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from robotcell.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from robotcell.geometry import Array
+    from robotcell.interfaces import Intrinsics
+
+Floats = npt.NDArray[np.float32]
+Indices = npt.NDArray[np.int32]
+
+_LIBUSB = "libusb-1.0.so.0"
+
+
+class Mesh(Protocol):
+    """A rigid triangle mesh in the frame of its link: vertices (N, 3) [m], triangles (M, 3) of vertex indices."""
+
+    @property
+    def vertices(self) -> Floats: ...
+
+    @property
+    def triangles(self) -> Indices: ...
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the rays of one frame met.
+
+    Attributes:
+        depth_m: (H, W) float32 [m] along the optical axis, 0 = nothing.
+        triangle: (H, W) int32, index into the two tables below, -1 = nothing (which is their last row).
+        visual_of: (T + 1,) int32, the mesh that each triangle belongs to; -1 in the last row.
+        normal_of: (T + 1, 3) float32, unit normals in base on the side of the camera; 0 in the last row.
+        range_of: (T + 1,) float32, distance [m] from the camera to the plane of each triangle; 0 in the last row.
+    """
+
+    depth_m: Floats
+    triangle: Indices
+    visual_of: Indices
+    normal_of: Floats
+    range_of: Floats
+
+    def visual(self) -> Indices:
+        """(H, W) index of the mesh that each pixel sees, -1 for none."""
+        return self.visual_of[self.triangle]
+
+    def normals(self) -> Floats:
+        """(H, W, 3) unit normals in base of what each pixel sees, towards the camera, 0 for nothing."""
+        return self.normal_of[self.triangle]
+
+
+class RayCaster:
+    """Casts the rays of one camera.
+
+    Embree cannot move what it has indexed, so each frame transforms all vertices and builds a new scene of one
+    geometry, which takes 1 to 3 ms for the few thousand triangles of the cell.
+
+    Args:
+        meshes: what there is to see.
+        intrinsics: pinhole model; the rays pass through the pixels' integer coordinates.
+        T_base_camera: pose of the colour optical frame (4, 4).
+        threads: that Embree may use.
+    """
+
+    def __init__(
+        self, meshes: Sequence[Mesh], intrinsics: Intrinsics, T_base_camera: Array, threads: int = 2
+    ) -> None:
+        self._open3d = load_open3d()
+        self._threads = threads
+        counts = [len(mesh.vertices) for mesh in meshes]
+        starts = np.cumsum([0, *counts])
+        self._vertices = np.concatenate([mesh.vertices for mesh in meshes], dtype=np.float32)
+        self._mesh_of_vertex = np.repeat(np.arange(len(meshes)), counts)
+        self._triangles = np.concatenate(
+            [mesh.triangles + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+        ).astype(np.uint32)
+        mesh_of_triangle = np.repeat(np.arange(len(meshes)), [len(mesh.triangles) for mesh in meshes])
+        self._visual_of = np.append(mesh_of_triangle, -1).astype(np.int32)
+        self._center = T_base_camera[:3, 3].astype(np.float32)
+        self._rays = self._open3d.core.Tensor(_rays(intrinsics, T_base_camera))
+
+    def cast(self, poses: Array) -> Hits:
+        """One frame.
+
+        Args:
+            poses: (K, 4, 4) poses of the meshes in base.
+        """
+        vertices = self._in_base(poses)
+        core = self._open3d.core
+        scene = self._open3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        scene.add_triangles(core.Tensor(vertices), core.Tensor(self._triangles))
+        answer = scene.cast_rays(self._rays, nthreads=self._threads)
+        # The rays are 1 m long along the optical axis, so the ray parameter is the depth.
+        depth = answer["t_hit"].numpy()
+        depth[np.isinf(depth)] = 0.0
+        corners = vertices[self._triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+        ranges = np.einsum("ij,ij->i", normals, self._center - corners[:, 0])
+        normals[ranges < 0] *= -1.0
+        return Hits(
+            depth_m=depth,
+            # Embree's "no hit" is the largest uint32, which reads as -1.
+            triangle=answer["primitive_ids"].numpy().view(np.int32),
+            visual_of=self._visual_of,
+            normal_of=np.append(normals, np.zeros((1, 3), np.float32), axis=0),
+            range_of=np.append(np.abs(ranges), np.float32(0)),
+        )
+
+    def _in_base(self, poses: Array) -> Floats:
+        T = poses.astype(np.float32)[self._mesh_of_vertex]
+        rotated = np.einsum("nij,nj->ni", T[:, :3, :3], self._vertices)
+        return np.ascontiguousarray(rotated + T[:, :3, 3], dtype=np.float32)
+
+
+@functools.cache
+def load_open3d() -> Any:
+    """The module open3d, which needs libusb at import even where no camera is used.
+
+    Where the system has no libusb, the one in the `libusb-package` wheel is loaded for all libraries of the process.
+
+    Raises:
+        ConfigError: open3d or libusb is not installed.
+    """
+    if sys.platform == "linux":
+        try:
+            ctypes.CDLL(_LIBUSB, mode=ctypes.RTLD_GLOBAL)
+        except OSError:
+            _load_packaged_libusb()
+    try:
+        return importlib.import_module("open3d")
+    except ImportError as error:
+        raise ConfigError(
+            f"the twin's camera cannot load open3d ({error}); install the twin: pip install 'robotcell[twin]'"
+        ) from error
+
+
+def _load_packaged_libusb() -> None:
+    try:
+        package = importlib.import_module("libusb_package")
+        ctypes.CDLL(str(package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError) as error:
+        raise ConfigError(
+            f"the twin's camera needs {_LIBUSB}, and neither the system nor the package libusb-package has it "
+            f"({error}); install the twin: pip install 'robotcell[twin]'"
+        ) from error
+
+
+def _rays(intrinsics: Intrinsics, T_base_camera: Array) -> Floats:
+    """(H, W, 6) origins and directions in base, the directions 1 m along the optical axis."""
+    directions = ray_directions(intrinsics) @ T_base_camera[:3, :3].T
+    origins = np.broadcast_to(T_base_camera[:3, 3], directions.shape)
+    return np.concatenate([origins, directions], axis=2, dtype=np.float32)
+
+
+def ray_directions(intrinsics: Intrinsics) -> Array:
+    """(H, W, 3) directions of the pixels in the camera frame, scaled to 1 along the optical axis."""
+    u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
+    x = (u - intrinsics.cx) / intrinsics.fx
+    y = (v - intrinsics.cy) / intrinsics.fy
+    return np.stack([x, y, np.ones_like(x)], axis=2)
