@@ -7,13 +7,16 @@ the UR5e (joint housings 120 to 150 mm, upper arm 110 mm, forearm 90 mm and wris
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from robotcell import kinematics, linkage
 from robotcell.config import CellConfig, KeepOut
-from robotcell.geometry import Array
+
+if TYPE_CHECKING:
+    from robotcell.geometry import Array
 
 # Distance of the upper arm's tube from the plane of the base, along the shoulder axis (UR5e drawing: 0.138 m).
 _UPPER_ARM_OFFSET_M = 0.138
@@ -77,7 +80,7 @@ SPHERES = robot_spheres()
 def sphere_centers(q: npt.ArrayLike) -> Array:
     """Centres (..., N, 3) of `SPHERES` in the base frame [m] at joint angles (..., 6)."""
     frames = kinematics.link_frames(q)[..., SPHERES.link, :, :]
-    return np.einsum("...nij,nj->...ni", frames[..., :3, :3], SPHERES.center) + frames[..., :3, 3]
+    return np.asarray(np.einsum("...nij,nj->...ni", frames[..., :3, :3], SPHERES.center) + frames[..., :3, 3])
 
 
 def obstacles(config: CellConfig) -> tuple[KeepOut, ...]:
@@ -130,7 +133,7 @@ def finger_points(T_base_tcp: Array, load_m: float) -> Array:
     """Points (..., K, 3) [m] that stand for the open fingers and for a load that reaches `load_m` below the tcp."""
     half = linkage.MAX_WIDTH_M / 2 + linkage.FINGER_THICKNESS_M
     tips = np.array([(side * half, 0.0, z) for side in (-1, 0, 1) for z in (-0.06, -0.03, load_m)])
-    return np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], tips) + T_base_tcp[..., None, :3, 3]
+    return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], tips) + T_base_tcp[..., None, :3, 3])
 
 
 def _sphere_pairs() -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -6,7 +6,6 @@ With no file the twin with its defaults. Lengths in metres, angles in radians, b
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
@@ -24,6 +23,8 @@ else:
     import tomli as tomllib
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from pydantic_core import ErrorDetails
 
     from robotcell.cell import Cell
@@ -278,7 +279,8 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        return values
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; start from examples/cell.toml") from None
     except OSError as error:

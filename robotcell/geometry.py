@@ -54,7 +54,7 @@ def invert_transform(T: Array) -> Array:
 
 def transform_points(T_a_b: Array, points_b: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
     """Map (..., 3) points in frame b to frame a [m]."""
-    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return np.asarray(points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3])
 
 
 def rotation_z(angle: float) -> Array:
@@ -83,7 +83,7 @@ def interpolate_transforms(T_start: Array, T_end: Array, fractions: npt.ArrayLik
     s = np.atleast_1d(np.asarray(fractions, dtype=np.float64))
     T = np.tile(np.eye(4), (len(s), 1, 1))
     T[:, :3, 3] = T_start[:3, 3] + s[:, None] * (T_end[:3, 3] - T_start[:3, 3])
-    T[:, :3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix([T_start[:3, :3], T_end[:3, :3]]))(s).as_matrix()
+    T[:, :3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_start[:3, :3], T_end[:3, :3]])))(s).as_matrix()
     return T
 
 

@@ -6,11 +6,14 @@ differs by up to a few millimetres: on hardware the controller's tcp pose is the
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 from ur_analytic_ik import ur5e
 
-from robotcell.geometry import Array
+if TYPE_CHECKING:
+    from robotcell.geometry import Array
 
 DH_A = np.array([0.0, -0.425, -0.3922, 0.0, 0.0, 0.0])
 DH_D = np.array([0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996])

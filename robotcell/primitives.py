@@ -28,6 +28,8 @@ T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, linkage.CLOSED_LENGTH_M))
 GRASP_DEPTH_M = 0.040
 # A load gripped 4 cm below its top reaches at most this far below the tcp (the tallest block is 100 mm).
 LOAD_REACH_M = 0.060
+# Label of the first check for a held object; one that passes here and fails later was lost on the way.
+HELD_AFTER_LIFT = "held after the lift"
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
 _NEAR_M = 0.020
 # Finger tips pass this high over the walls of the bin with a load.
@@ -115,10 +117,9 @@ def plan_action(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
 
 def plan_retreat(state: ArmState, config: CellConfig) -> MotionPlan:
     """Straight up to the approach height, open the fingers, go home: from wherever the arm stands."""
-    x, y, z = state.T_base_tcp[:3, 3]
     clear_z = config.table.height_m + config.motion.approach_m + GRASP_DEPTH_M
     steps: list[Step] = []
-    if z < clear_z:
+    if state.T_base_tcp[2, 3] < clear_z:
         T_up = state.T_base_tcp.copy()
         T_up[2, 3] = clear_z
         steps.append(_linear("retreat", T_up, config))
@@ -173,10 +174,8 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
             contact_force_n=motion.contact_force_n,
         ),
         Grip("close", linkage.MIN_WIDTH_M, use.force_n),
-        LinearMove(
-            "lift", T_above, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M
-        ),
-        CheckHold("held after the lift", use.empty_width_m),
+        LinearMove("lift", T_above, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
+        CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
         _joint("carry to bin", q_bin, config, load_m=LOAD_REACH_M),
         CheckHold("held over the bin", use.empty_width_m),
         Grip("release", use.preshape_m, use.force_n),

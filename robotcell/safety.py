@@ -19,7 +19,7 @@ from robotcell.interfaces import ArmMode, ArmState
 from robotcell.primitives import T_FLANGE_TCP, CheckHold, Grip, JointMove, LinearMove, MotionPlan, flange_pose
 
 if TYPE_CHECKING:
-    from robotcell.config import CellConfig
+    from robotcell.config import CellConfig, KeepOut
 
 # Distance between the samples of a checked path. A joint step of 0.04 rad moves the outstretched tcp by 40 mm.
 _JOINT_STEP_RAD = 0.04
@@ -59,7 +59,11 @@ def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
             goal = _joint_vector(step.q, name)
             _check_below(step.speed_rad_s, config.limits.joint_speed_rad_s, "joint speed", "rad/s", name)
             _check_below(
-                step.acceleration_rad_s2, kinematics.MAX_JOINT_ACCELERATION, "joint acceleration", "rad/s2", name
+                step.acceleration_rad_s2,
+                kinematics.MAX_JOINT_ACCELERATION,
+                "joint acceleration",
+                "rad/s2",
+                name,
             )
             count = int(np.ceil(np.abs(goal - q).max() / _JOINT_STEP_RAD)) + 1
             path = q + np.linspace(0.0, 1.0, max(count, 2))[:, None] * (goal - q)
@@ -104,7 +108,7 @@ class Guard:
         off = float(np.abs(state.q - plan.q_start).max())
         if off > _START_TOLERANCE_RAD:
             raise UnsafeMotion(
-                f"{plan.label}: a joint is {off:.3f} rad from where the plan starts; plan again from the measured joints"
+                f"{plan.label}: a joint is {off:.3f} rad from the start of the plan; plan again from the measured joints"
             )
 
     def check(self, state: ArmState, now: float) -> None:
@@ -209,9 +213,7 @@ def _linear_path(q: Array, step: LinearMove, config: CellConfig, name: str) -> A
     return path
 
 
-def _check_path(
-    path: Array, load_m: float, obstacles: tuple[collision.KeepOut, ...], config: CellConfig, name: str
-) -> None:
+def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], config: CellConfig, name: str) -> None:
     limits, table = config.limits, config.table.height_m
     margin = kinematics.JOINT_LIMIT - limits.joint_margin_rad
     if (np.abs(path) > margin).any():
@@ -244,9 +246,9 @@ def _check_path(
         raise UnsafeMotion(f"{name}: the arm or the gripper's body would touch the table")
     points = collision.finger_points(T_tcp, load_m)
     for box in obstacles:
-        hit = (collision.box_distance(box, centers) < radius)[:, above].any()
-        hit = hit or bool((collision.box_distance(box, points) < limits.clearance_m).any())
-        if hit:
+        body = (collision.box_distance(box, centers) < radius)[:, above]
+        fingers = collision.box_distance(box, points) < limits.clearance_m
+        if body.any() or fingers.any():
             raise UnsafeMotion(f"{name}: the arm, the gripper or its load would enter the keep-out {box.name!r}")
     if (collision.self_distance(centers) < limits.clearance_m).any():
         raise UnsafeMotion(f"{name}: the arm or the gripper would touch the arm itself")

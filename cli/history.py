@@ -1,0 +1,108 @@
+"""`robotcell jobs`: what past jobs did, from the journal."""
+
+from __future__ import annotations
+
+from math import isnan
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from cli.errors import report_error
+from robotcell.config import load_config
+from robotcell.errors import CellError
+from robotcell.journal import Job, Journal, Metrics
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def list_jobs(cell_file: Path | None, limit: int) -> int:
+    """Print the newest jobs; returns the exit code."""
+    try:
+        with Journal(load_config(cell_file).journal.database_url()) as journal:
+            rows = [(job, journal.metrics(job.id)) for job in journal.jobs(limit)]
+    except CellError as error:
+        return report_error(error, Console(stderr=True, highlight=False))
+    out = Console(highlight=False)
+    if not rows:
+        out.print("no jobs yet")
+        return 0
+    table = Table("job", "started (UTC)", "goal", "policy", "status", "picked", "actions", "success", "run")
+    for job, metrics in rows:
+        table.add_row(
+            str(job.id),
+            f"{job.started:%Y-%m-%d %H:%M:%S}",
+            _goal(job),
+            job.policy,
+            job.status,
+            str(metrics.grasp_successes),
+            str(metrics.actions),
+            _percent(metrics.grasp_success_rate),
+            Text(job.run_dir, overflow="fold"),
+        )
+    out.print(table)
+    return 0
+
+
+def show_job(cell_file: Path | None, job_id: int) -> int:
+    """Print one job with its actions and metrics; returns the exit code."""
+    try:
+        with Journal(load_config(cell_file).journal.database_url()) as journal:
+            job, metrics = journal.job(job_id), journal.metrics(job_id)
+    except CellError as error:
+        return report_error(error, Console(stderr=True, highlight=False))
+    out = Console(highlight=False)
+    out.print(f"job {job.id}: pick {_goal(job)} with {job.policy}, {job.status}", style="bold")
+    if job.reason:
+        out.print(job.reason, soft_wrap=True)
+    out.print(_actions(job))
+    out.print(_figures(metrics))
+    out.print(f"pictures: {job.run_dir}", soft_wrap=True)
+    return 0
+
+
+def _actions(job: Job) -> Table:
+    table = Table("", "goal", "action", "x, y, z [m]", "angle [deg]", "q", "seconds", "result", "detail")
+    for index, action in enumerate(job.actions, start=1):
+        outcome = action.outcome
+        table.add_row(
+            str(index),
+            action.goal or "any",
+            action.primitive,
+            f"{action.x:.3f}, {action.y:.3f}, {action.z:.3f}",
+            f"{22.5 * action.rotation:.1f}",
+            f"{action.q_value:.2f}",
+            f"{outcome.ended_s - action.started_s:.1f}" if outcome else "",
+            outcome.result if outcome else "cut off",
+            outcome.detail if outcome else "",
+        )
+    return table
+
+
+def _figures(metrics: Metrics) -> Table:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in (
+        ("motions", str(metrics.actions)),
+        ("pushes", str(metrics.pushes)),
+        (
+            "grasps",
+            f"{metrics.grasp_successes} of {metrics.grasp_attempts} ({_percent(metrics.grasp_success_rate)})",
+        ),
+        ("picked", ", ".join(metrics.picked) or "nothing"),
+        (
+            "picks per hour",
+            "-" if isnan(metrics.picks_per_hour) else f"{metrics.picks_per_hour:.0f}",
+        ),
+    ):
+        table.add_row(Text(name, style="bold"), value)
+    return table
+
+
+def _goal(job: Job) -> str:
+    return ",".join(job.goals) if job.goals else "all"
+
+
+def _percent(share: float) -> str:
+    return "-" if isnan(share) else f"{share:.0%}"

@@ -1,0 +1,101 @@
+"""The `robotcell` command.
+
+Exit codes: 0 complete, 1 not complete, 2 wrong usage or configuration, 3 a device or the safety layer stopped the
+cell, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+# Everything heavy is imported inside the commands, so that --help answers at once.
+
+app = typer.Typer(
+    help="Pick objects with a UR5e, an RG2 and a D415, or with their simulated twin.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+jobs_app = typer.Typer(help="What past jobs did.", invoke_without_command=True, pretty_exceptions_enable=False)
+app.add_typer(jobs_app, name="jobs")
+
+CellFile = Annotated[
+    Path | None, typer.Option("--cell", help="The cell's TOML file; without one, the twin with its defaults.")
+]
+
+
+@app.command()
+def pick(
+    goal: Annotated[
+        str | None, typer.Option(help="Colour to pick, or several in order: red,blue.", show_default=False)
+    ] = None,
+    all_: Annotated[bool, typer.Option("--all", help="Pick everything on the table.")] = False,
+    cell: CellFile = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(help="Twin: random, novel, challenging-01 to -10, or a scene file.", show_default=False),
+    ] = None,
+    meshes: Annotated[
+        Path | None,
+        typer.Option(help="Twin: folder of the OBJ files that a scene file names.", show_default=False),
+    ] = None,
+    objects: Annotated[
+        int | None, typer.Option(help="Twin: how many objects a random scene has.", show_default=False)
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Twin: the same seed gives the same job.", show_default=False)
+    ] = None,
+    policy: Annotated[str | None, typer.Option(help="Who decides, for example heuristic.", show_default=False)] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Look, decide, plan, check and draw one action; move nothing.")
+    ] = False,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON summary and nothing else.")] = False,
+) -> None:
+    """Pick one or several goals, or everything.
+
+    Exit codes: 0 complete, 1 not complete, 2 usage or configuration, 3 device or safety stop.
+    """
+    from cli.pick import run_pick
+
+    overrides = {
+        "backend.options.scene": scene,
+        "backend.options.meshes": meshes,
+        "backend.options.objects": objects,
+        "backend.options.seed": seed,
+        "policy.name": policy,
+    }
+    given = {key: value for key, value in overrides.items() if value is not None}
+    raise typer.Exit(run_pick(goal, all_, cell, given, dry_run=dry_run, as_json=json_))
+
+
+@jobs_app.callback()
+def jobs(
+    context: typer.Context,
+    cell: CellFile = None,
+    limit: Annotated[int, typer.Option(min=1, help="How many of the newest jobs.")] = 20,
+) -> None:
+    """List the newest jobs."""
+    if context.invoked_subcommand is None:
+        from cli.history import list_jobs
+
+        raise typer.Exit(list_jobs(cell, limit))
+
+
+@jobs_app.command()
+def show(job: Annotated[int, typer.Argument(help="The job's number.")], cell: CellFile = None) -> None:
+    """Print one job: its actions, what came of them, and its metrics."""
+    from cli.history import show_job
+
+    raise typer.Exit(show_job(cell, job))
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(130)

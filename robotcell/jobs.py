@@ -1,0 +1,450 @@
+"""Pick-goal and pick-all: look, decide, plan, check, run, judge, until the request is met or given up.
+
+A job is the loop around that line. What it did is in the journal; whoever wants to follow it is an observer.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import TYPE_CHECKING, Protocol
+
+import cv2
+import numpy as np
+
+from robotcell.decision import Action, Observation, Policy, Primitive
+from robotcell.errors import CalibrationError, CellError, DeviceFault, NoTarget, UnsafeMotion
+from robotcell.executor import Ending, Execution, Executor
+from robotcell.heightmap import Heightmap, build_heightmap
+from robotcell.journal import ActionRow, Frame, Journal, Metrics, OutcomeRow
+from robotcell.perception import Instance, Segmentation, find_goal, segment
+from robotcell.primitives import HELD_AFTER_LIFT, plan_action, plan_retreat
+from robotcell.safety import Guard, check_plan
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy.typing as npt
+
+    from robotcell.cell import Cell
+    from robotcell.interfaces import RgbdFrame
+    from robotcell.primitives import MotionPlan
+
+# Paper, section "The problem": at most 5 pushes in a row for one goal; "Evaluation": 10 consecutive failed
+# attempts end a run.
+MAX_PUSHES_IN_A_ROW = 5
+MAX_FAILURES_IN_A_ROW = 10
+# A cell whose height changes by more than this has changed hands; five times the depth noise of the camera.
+_CHANGED_M = 0.010
+# An object has left its place when this share of the cells that show it is lower than before.
+_GONE_SHARE = 0.6
+# A push that changes fewer cells than this (4 cm2 at 2 mm) moved nothing.
+_MOVED_CELLS = 100
+# The fingers can only have taken an object that was seen this close to them.
+_REACH_M = 0.06
+
+
+class Result(str, enum.Enum):
+    """What an action came to."""
+
+    PICKED = "picked"
+    WRONG_OBJECT = "wrong object"
+    MISSED = "missed"  # the fingers closed on nothing
+    LOST = "lost"  # held after the lift, no longer over the bin
+    COLLIDED = "collided"  # something was in the way of the fingers
+    UNCONFIRMED = "unconfirmed"  # the gripper held something that the camera does not miss
+    PUSHED = "pushed"
+    NOTHING_MOVED = "nothing moved"
+    REFUSED = "refused"  # the plan was unsafe; nothing moved
+    STOPPED = "stopped"  # a device or the safety layer stopped the cell
+
+
+@dataclass(frozen=True)
+class View:
+    """One look at the table."""
+
+    frame: RgbdFrame
+    heightmap: Heightmap
+    segmentation: Segmentation
+
+
+@dataclass(frozen=True)
+class Decision:
+    """An action about to be run."""
+
+    index: int
+    goal: str | None
+    view: View
+    action: Action
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a decision; `picked` is the colour of the object that left the table."""
+
+    result: Result
+    picked: str | None
+    detail: str
+    peak_force_n: float
+
+    @property
+    def success(self) -> bool:
+        """Whether the action did what it was for."""
+        return self.result in {Result.PICKED, Result.PUSHED}
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a job ended; `reason` says why one that is not complete was given up."""
+
+    job_id: int
+    run_dir: Path
+    completed: bool
+    reason: str
+    metrics: Metrics
+    cell_s: float
+
+
+class Observer(Protocol):
+    """Follows a job."""
+
+    def started(self, job_id: int, run_dir: Path) -> None:
+        """The job is in the journal and its folder is made."""
+        ...
+
+    def looked(self, view: View) -> None:
+        """The camera was read."""
+        ...
+
+    def decided(self, decision: Decision) -> None:
+        """An action is about to run."""
+        ...
+
+    def ended(self, decision: Decision, outcome: Outcome) -> None:
+        """An action ended."""
+        ...
+
+
+def look(cell: Cell) -> View:
+    """Read the camera and see what is on the table.
+
+    Raises:
+        ConnectionLost, DeviceFault: the camera delivers nothing, or a stale or sparse frame.
+        CalibrationError: the table is not where the configuration has it.
+    """
+    config, limits = cell.config, cell.config.limits
+    frame = cell.camera.read()
+    age = cell.clock.now() - frame.t
+    if age > limits.frame_age_s:
+        raise DeviceFault(f"frame {frame.number} is {age:.2f} s old (limit {limits.frame_age_s} s): check the camera")
+    heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+    if heightmap.coverage < limits.min_coverage:
+        raise DeviceFault(
+            f"the camera sees {heightmap.coverage:.0%} of the workspace (limit {limits.min_coverage:.0%}): "
+            "check its view, its lens and the light"
+        )
+    table = heightmap.table
+    if table is None:
+        raise CalibrationError("too little of the table is seen to tell where it is: clear a part of the workspace")
+    if table.tilt_rad > limits.max_tilt_rad or abs(table.offset_m) > limits.max_table_offset_m:
+        raise CalibrationError(
+            f"the table appears tilted by {np.degrees(table.tilt_rad):.2f} degrees and {1000 * table.offset_m:+.1f} mm "
+            f"off (limits {np.degrees(limits.max_tilt_rad):.2f} degrees, {1000 * limits.max_table_offset_m:.1f} mm): "
+            "check table.height_m and the camera's pose, calibrate again if it was moved"
+        )
+    return View(frame, heightmap, segment(heightmap))
+
+
+def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, MotionPlan]:
+    """Look, decide, plan and check one action; nothing moves.
+
+    Raises:
+        NoTarget, UnsafeMotion and what `look` raises.
+    """
+    view = look(cell)
+    action = policy.decide(_observe(view, goal, (), may_push=True))
+    plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
+    return Decision(1, goal, view, action), check_plan(plan, cell.config).plan
+
+
+def run_job(
+    cell: Cell,
+    policy: Policy,
+    journal: Journal,
+    goals: tuple[str, ...] | None,
+    observers: tuple[Observer, ...] = (),
+) -> Report:
+    """Pick the goals (colours) in their order, or with None everything on the table.
+
+    Raises:
+        NoTarget: a goal is not on the table when its turn comes; the message lists what is.
+        DeviceFault, ConnectionLost, GuardTripped, CalibrationError: the cell was stopped. The journal has it.
+    """
+    run_dir = _make_run_dir(cell.config.journal.runs, goals)
+    job_id = journal.start_job(goals, policy.name, cell.config.model_dump(mode="json"), run_dir)
+    for observer in observers:
+        observer.started(job_id, run_dir)
+    started = cell.clock.now()
+    job = _Job(cell, policy, journal, observers, job_id, run_dir)
+    status, reason = "stopped", ""
+    try:
+        reason = job.pick_in_order(goals) if goals else job.pick_all()
+        status = "incomplete" if reason else "complete"
+    except NoTarget as error:
+        status, reason = "incomplete", str(error)
+        raise
+    except BaseException as error:
+        reason = str(error) or type(error).__name__
+        raise
+    finally:
+        cell_s = cell.clock.now() - started
+        journal.end_job(job_id, status, reason, cell_s)
+    return Report(job_id, run_dir, not reason, reason, journal.metrics(job_id), cell_s)
+
+
+@dataclass
+class _Job:
+    cell: Cell
+    policy: Policy
+    journal: Journal
+    observers: tuple[Observer, ...]
+    job_id: int
+    run_dir: Path
+    actions: int = 0
+    guard: Guard = field(init=False)
+    executor: Executor = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.guard = Guard(self.cell.config)
+        self.executor = Executor(self.cell, self.guard)
+
+    def pick_in_order(self, goals: tuple[str, ...]) -> str:
+        """Pick one goal after the other; "" or why it was given up."""
+        view = self._start()
+        for goal in goals:
+            find_goal(view.segmentation, goal)
+            view, reason = self._pick_until(goal, view)
+            if reason:
+                return reason
+        return ""
+
+    def pick_all(self) -> str:
+        """Pick until nothing is left; "" or why it was given up."""
+        _view, reason = self._pick_until(None, self._start())
+        return reason
+
+    def _start(self) -> View:
+        """Go home from wherever the arm stands, and look."""
+        state = self.cell.arm.state()
+        off = np.abs(state.q - np.array(self.cell.config.motion.home_q)).max()
+        if off > 0.01:
+            self._retreat()
+        return self._look()
+
+    def _look(self) -> View:
+        view = look(self.cell)
+        for observer in self.observers:
+            observer.looked(view)
+        return view
+
+    def _pick_until(self, goal: str | None, view: View) -> tuple[View, str]:
+        """Act until the goal (or, with None, everything) is picked; the last view, and why it was given up."""
+        failures = pushes = 0
+        barred: tuple[Action, ...] = ()
+        while goal is not None or view.segmentation.instances:
+            try:
+                observation = _observe(view, goal, barred, may_push=pushes < MAX_PUSHES_IN_A_ROW)
+                action = self.policy.decide(observation)
+            except NoTarget as error:
+                return view, str(error)
+            view, outcome = self._act(goal, view, action)
+            pushes = pushes + 1 if action.primitive is Primitive.PUSH else 0
+            failures = 0 if outcome.success else failures + 1
+            barred = () if outcome.result in {Result.PICKED, Result.WRONG_OBJECT, Result.PUSHED} else (*barred, action)
+            if outcome.result is Result.PICKED and goal is not None:
+                return view, ""
+            if failures >= MAX_FAILURES_IN_A_ROW:
+                return (
+                    view,
+                    f"given up after {failures} failed attempts in a row, the last one: {outcome.detail}",
+                )
+        return view, ""
+
+    def _act(self, goal: str | None, view: View, action: Action) -> tuple[View, Outcome]:
+        """Run one action between its two rows of the journal; the view after it."""
+        self.actions += 1
+        decision = Decision(self.actions, goal, view, action)
+        x, y, z = action.xyz
+        action_id = self.journal.start_action(
+            ActionRow(
+                job_id=self.job_id,
+                frame_id=self._keep_frame(view),
+                goal=goal,
+                primitive=action.primitive.value,
+                row=action.row,
+                col=action.col,
+                rotation=action.rotation,
+                x=x,
+                y=y,
+                z=z,
+                q_value=action.q_value,
+                started_s=self.cell.clock.now(),
+            )
+        )
+        for observer in self.observers:
+            observer.decided(decision)
+        try:
+            after, outcome = self._run(decision)
+        except BaseException as error:
+            self._end_action(action_id, decision, Outcome(Result.STOPPED, None, str(error), float("nan")))
+            raise
+        self._end_action(action_id, decision, outcome)
+        return after, outcome
+
+    def _end_action(self, action_id: int, decision: Decision, outcome: Outcome) -> None:
+        self.journal.end_action(
+            OutcomeRow(
+                action_id=action_id,
+                result=outcome.result.value,
+                success=outcome.success,
+                picked=outcome.picked,
+                detail=outcome.detail,
+                peak_force_n=outcome.peak_force_n if np.isfinite(outcome.peak_force_n) else 0.0,
+                ended_s=self.cell.clock.now(),
+            )
+        )
+        for observer in self.observers:
+            observer.ended(decision, outcome)
+
+    def _run(self, decision: Decision) -> tuple[View, Outcome]:
+        cell, action = self.cell, decision.action
+        try:
+            plan = plan_action(action, decision.view.heightmap, cell.arm.state().q, cell.config)
+            checked = check_plan(plan, cell.config)
+        except UnsafeMotion as error:
+            return decision.view, Outcome(Result.REFUSED, None, str(error), 0.0)
+        execution = self.executor.run(checked)
+        if execution.ending is not Ending.DONE:
+            self._retreat()
+        after = self._look()
+        return after, judge(decision, after, execution)
+
+    def _retreat(self) -> None:
+        plan = plan_retreat(self.cell.arm.state(), self.cell.config)
+        self.executor.run(check_plan(plan, self.cell.config))
+
+    def _keep_frame(self, view: View) -> int:
+        """Write the frame's images beside the run and note them in the journal."""
+        frame, table = view.frame, view.heightmap.table
+        folder = self.run_dir / "frames"
+        folder.mkdir(exist_ok=True)
+        color_file, depth_file = (
+            folder / f"{frame.number:06d}-color.png",
+            folder / f"{frame.number:06d}-depth.png",
+        )
+        # Depth in 1/10 mm: finer than the device's own unit, and 16 bits reach 6.5 m.
+        depth = np.clip(np.round(frame.depth_m * 1e4), 0, 65535).astype(np.uint16)
+        for path, image in ((color_file, frame.color[..., ::-1]), (depth_file, depth)):
+            if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+                raise DeviceFault(f"{path} cannot be written: check the disk")
+        return self.journal.add_frame(
+            Frame(
+                job_id=self.job_id,
+                number=frame.number,
+                t=frame.t,
+                color_file=str(color_file),
+                depth_file=str(depth_file),
+                coverage=view.heightmap.coverage,
+                tilt_rad=table.tilt_rad if table else float("nan"),
+                offset_m=table.offset_m if table else float("nan"),
+            )
+        )
+
+
+def judge(decision: Decision, after: View, execution: Execution) -> Outcome:
+    """What an action came to, by the gripper and by the heightmaps before and after it."""
+    if decision.action.primitive is Primitive.PUSH:
+        return _judge_push(decision, after, execution)
+    return _judge_grasp(decision, after, execution)
+
+
+def _judge_push(decision: Decision, after: View, execution: Execution) -> Outcome:
+    changed = _changed(decision.view.heightmap, after.heightmap)
+    result = Result.PUSHED if changed >= _MOVED_CELLS else Result.NOTHING_MOVED
+    return Outcome(result, None, f"{changed} cells changed", execution.peak_force_n)
+
+
+def _judge_grasp(decision: Decision, after: View, execution: Execution) -> Outcome:
+    force, width = execution.peak_force_n, f"{1000 * execution.width_m:.1f} mm"
+    if execution.ending is Ending.CONTACT:
+        return Outcome(Result.COLLIDED, None, f"{force:.0f} N during {execution.step!r}", force)
+    if execution.ending is Ending.EMPTY:
+        result = Result.MISSED if execution.step == HELD_AFTER_LIFT else Result.LOST
+        return Outcome(result, None, f"the fingers were {width} apart at {execution.step!r}", force)
+    taken = _taken(decision, after)
+    if taken is None:
+        return Outcome(Result.UNCONFIRMED, None, "something was held, but nothing is missing on the table", force)
+    picked = taken.color_name
+    if decision.goal is not None and picked != decision.goal:
+        return Outcome(Result.WRONG_OBJECT, picked, f"took {picked} instead of {decision.goal}", force)
+    return Outcome(Result.PICKED, picked, f"{picked}, held {width} wide", force)
+
+
+def _observe(view: View, goal: str | None, barred: tuple[Action, ...], *, may_push: bool) -> Observation:
+    """What the policy is shown.
+
+    Raises:
+        NoTarget: the goal is not on the table.
+    """
+    labels = view.segmentation.labels
+    objects = labels > 0
+    goal_mask = labels == find_goal(view.segmentation, goal).label if goal is not None else None
+    return Observation(view.heightmap, objects, goal_mask, barred, may_push)
+
+
+def _taken(decision: Decision, after: View) -> Instance | None:
+    """The object that left the table: the one that the action was aimed at, or else the nearest that is gone."""
+    before, action = decision.view, decision.action
+    sunk = _sunk(before.heightmap, after.heightmap)
+    known = np.isfinite(before.heightmap.height_m) & np.isfinite(after.heightmap.height_m)
+    aimed_at = before.segmentation.labels[action.row, action.col]
+    gone: list[tuple[bool, float, Instance]] = []
+    for instance in before.segmentation.instances:
+        cells = (before.segmentation.labels == instance.label) & known
+        if not cells.any() or (sunk & cells).sum() < _GONE_SHARE * cells.sum():
+            continue
+        x, y = instance.centroid
+        distance = float(np.hypot(x - action.xyz[0], y - action.xyz[1]))
+        if instance.label == aimed_at or distance < _REACH_M:
+            gone.append((instance.label != aimed_at, distance, instance))
+    return min(gone, key=lambda entry: entry[:2])[2] if gone else None
+
+
+def _sunk(before: Heightmap, after: Heightmap) -> npt.NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(before.height_m - after.height_m > _CHANGED_M)
+
+
+def _changed(before: Heightmap, after: Heightmap) -> int:
+    with np.errstate(invalid="ignore"):
+        return int((np.abs(before.height_m - after.height_m) > _CHANGED_M).sum())
+
+
+def _make_run_dir(runs: Path, goals: tuple[str, ...] | None) -> Path:
+    """A new folder runs/<time>-<what>, numbered where the second does not tell two runs apart.
+
+    Raises:
+        CellError: it cannot be made.
+    """
+    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{'-'.join(goals) if goals else 'all'}"
+    for suffix in ("", *(f"-{n}" for n in range(2, 100))):
+        path = runs / f"{stem}{suffix}"
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise CellError(f"the folder {path} cannot be made: {error.strerror}; set journal.runs") from error
+        return path
+    raise CellError(f"there are a hundred runs called {stem} in {runs}")
