@@ -1,0 +1,263 @@
+"""The twin's UR5e: position-controlled joints of limited torque that follow trapezoidal profiles.
+
+It refuses what the controller refuses, and stops by itself where the controller does: on a contact force, on a joint
+that cannot follow, and when the supervisor falls silent.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotcell import kinematics, linkage
+from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.geometry import (
+    Array,
+    check_transform,
+    interpolate_transforms,
+    invert_transform,
+    make_transform,
+    rotation_angle,
+)
+from robotcell.interfaces import ArmMode, ArmState
+from sim_twin import robot_model
+from sim_twin.trajectory import slow_down, trapezoid
+from sim_twin.world import STEP_S
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from sim_twin.world import World
+
+# Universal Robots, URScript manual: stopj brakes at the deceleration that it is given; ur_rtde's stop passes 10.
+STOP_DECELERATION_RAD_S2 = 10.0
+# Universal Robots, factory safety preset of the UR5e: force limit.
+PROTECTIVE_FORCE_N = 150.0
+# A joint this far from where it should be could not follow: its motor is at its limit. Assumed.
+TRACKING_ERROR_RAD = 0.05
+WATCHDOG_S = 0.1
+
+# Share of the position error that the joint controllers correct within a step.
+_POSITION_GAIN = 0.5
+# A rotation counts as the way that the flange goes when it turns about the tcp: no end of the tool outruns the speed.
+_ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
+# Two neighbouring samples of a path that differ by more than this are different configurations of the arm.
+_BRANCH_STEP_RAD = 0.3
+
+T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, linkage.CLOSED_LENGTH_M))
+_T_TCP_FLANGE = invert_transform(T_FLANGE_TCP)
+
+
+class TwinArm:
+    """The `Arm` of a world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._connected = False
+        self._joints: list[int] = []
+        self._mode = ArmMode.READY
+        # The motion under way: (N, 6) joint angles, one per step, and the sample that was commanded last.
+        self._path = np.empty((0, 6))
+        self._index = 0
+        self._braking = False
+        self._force_at_start = np.zeros(3)
+        self._kicked_at: float | None = None
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def connect(self) -> None:
+        """Attach to the world and hold the arm where it is. Does nothing when connected."""
+        if self._connected:
+            return
+        self._world.attach(self)
+        self._joints = self._world.joint_index(robot_model.ARM_JOINTS)
+        self._mode = ArmMode.READY
+        self._kicked_at = None
+        self._hold()
+        self._world.add_controller(self._control)
+        self._connected = True
+
+    def close(self) -> None:
+        """Stop the arm and let the world go. Idempotent."""
+        if self._connected:
+            self._hold()
+            self._world.remove_controller(self._control)
+            self._connected = False
+            self._world.detach(self)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a motion, or the braking that ends it, is under way."""
+        self._need_connection()
+        return self._index < len(self._path) - 1
+
+    def state(self) -> ArmState:
+        """The state after the last step.
+
+        The wrench is the sum of the contact forces on gripper and fingers, as the sensor in the flange reports them
+        once the gripper's own weight is subtracted: a held object's weight is in it, the arm's inertia is not.
+        """
+        self._need_connection()
+        q, qd = self._world.joint_states(self._joints)
+        contact = self._world.contact()
+        return ArmState(
+            t=self._world.time_s,
+            q=q,
+            qd=qd,
+            T_base_tcp=kinematics.forward(q) @ T_FLANGE_TCP,
+            wrench=np.concatenate([contact.tool_force, contact.tool_torque]),
+            mode=self._mode,
+        )
+
+    def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Start a joint-space motion; see `Arm`.
+
+        Raises:
+            UnsafeMotion: q is outside the joint limits or not six finite numbers, speed or acceleration are outside
+                the controller's range, or the arm is moving.
+            DeviceFault: the arm is stopped.
+        """
+        self._need_ready()
+        target = np.asarray(q, dtype=np.float64)
+        if target.shape != (6,) or not np.isfinite(target).all():
+            raise UnsafeMotion(f"joint target {q!r}: six finite angles are needed")
+        if (np.abs(target) > kinematics.JOINT_LIMIT).any():
+            joint = int(np.argmax(np.abs(target) - kinematics.JOINT_LIMIT))
+            limit = kinematics.JOINT_LIMIT[joint]
+            raise UnsafeMotion(f"joint {joint + 1} is sent to {target[joint]:.3f} rad; its limit is {limit:.3f}")
+        _check_range("speed", speed_rad_s, kinematics.MAX_JOINT_SPEED, "rad/s")
+        _check_range("acceleration", acceleration_rad_s2, kinematics.MAX_JOINT_ACCELERATION, "rad/s^2")
+        start = self._path[-1]
+        distance = float(np.abs(target - start).max())
+        s = trapezoid(distance, speed_rad_s, acceleration_rad_s2, STEP_S)
+        if len(s):
+            self._start(start + (s / distance)[:, None] * (target - start))
+
+    def start_linear(self, T_base_tcp: Array, speed_m_s: float, acceleration_m_s2: float) -> None:
+        """Start a straight motion of the tcp; see `Arm`.
+
+        Raises:
+            UnsafeMotion: the pose is no rigid transform, it or a pose on the way is out of reach or singular, a joint
+                would have to turn faster than it can, speed or acceleration are outside the controller's range, or
+                the arm is moving.
+            DeviceFault: the arm is stopped.
+        """
+        self._need_ready()
+        try:
+            T_goal = check_transform(T_base_tcp, "T_base_tcp")
+        except ValueError as error:
+            raise UnsafeMotion(str(error)) from None
+        _check_range("speed", speed_m_s, kinematics.MAX_TOOL_SPEED, "m/s")
+        _check_range("acceleration", acceleration_m_s2, kinematics.MAX_TOOL_ACCELERATION, "m/s^2")
+        q = self._path[-1]
+        T_start = kinematics.forward(q) @ T_FLANGE_TCP
+        turn = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
+        distance = max(float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3])), turn * _ROTATION_LEVER_M)
+        s = trapezoid(distance, speed_m_s, acceleration_m_s2, STEP_S)
+        if not len(s):
+            return
+        poses = interpolate_transforms(T_start, T_goal, s / distance) @ _T_TCP_FLANGE
+        try:
+            path = kinematics.inverse_along(poses, q, _BRANCH_STEP_RAD)
+        except ValueError as error:
+            raise UnsafeMotion(f"straight motion refused: {error}") from None
+        speeds = np.abs(np.diff(path, axis=0, prepend=q[None])) / STEP_S
+        if speeds.max() > kinematics.MAX_JOINT_SPEED:
+            joint = int(np.argmax(speeds.max(axis=0)))
+            raise UnsafeMotion(
+                f"straight motion refused: joint {joint + 1} would have to turn at {speeds.max():.1f} rad/s, its "
+                f"limit is {kinematics.MAX_JOINT_SPEED:.2f}; go slower, or keep away from the singularity"
+            )
+        self._start(path)
+
+    def stop(self) -> None:
+        """Brake along the path at `STOP_DECELERATION_RAD_S2`."""
+        self._need_connection()
+        if self.moving and not self._braking:
+            rest = slow_down(self._path, self._index, STOP_DECELERATION_RAD_S2, STEP_S)
+            self._path = np.vstack([self._path[self._index], rest])
+            self._index = 0
+            self._braking = True
+
+    def kick(self) -> None:
+        """Arm the watchdog: from now on a motion stops when no kick comes for `WATCHDOG_S` of simulated time."""
+        self._need_connection()
+        self._kicked_at = self._world.time_s
+
+    def recover(self) -> None:
+        """Leave a protective stop; the next motion starts from where the joints are. Does nothing when ready."""
+        self._need_connection()
+        if self._mode is ArmMode.PROTECTIVE_STOP:
+            self._hold()
+            self._mode = ArmMode.READY
+
+    def _start(self, path: Array) -> None:
+        self._path = np.vstack([self._path[-1], path])
+        self._index = 0
+        self._braking = False
+        self._force_at_start = self._world.contact().robot_force
+        if self._kicked_at is not None:
+            self._kicked_at = self._world.time_s
+
+    def _control(self) -> None:
+        """One control period: watch, then command the next sample."""
+        if self._index >= len(self._path) - 1:
+            return
+        if self._must_protect():
+            self._hold()
+            self._mode = ArmMode.PROTECTIVE_STOP
+            return
+        if self._kicked_at is not None and self._world.time_s - self._kicked_at > WATCHDOG_S:
+            self.stop()
+            if self._index >= len(self._path) - 1:
+                return
+        self._index += 1
+        self._command(self._path[self._index])
+
+    def _must_protect(self) -> bool:
+        # Measured from the force at the start, so that the arm can leave a contact that stopped it.
+        force = self._world.contact().robot_force - self._force_at_start
+        if math.sqrt(float(force @ force)) > PROTECTIVE_FORCE_N:
+            return True
+        q, _ = self._world.joint_states(self._joints)
+        return float(np.abs(q - self._path[self._index]).max()) > TRACKING_ERROR_RAD
+
+    def _hold(self) -> None:
+        q, _ = self._world.joint_states(self._joints)
+        self._path = q[None]
+        self._index = 0
+        self._braking = False
+        self._command(q)
+
+    def _command(self, q: Array) -> None:
+        self._world.drive_positions(self._joints, q.tolist(), robot_model.JOINT_TORQUE_NM, _GAINS)
+
+    def _need_connection(self) -> None:
+        if not self._connected:
+            raise ConnectionLost("the twin's arm is not connected: connect it first")
+
+    def _need_ready(self) -> None:
+        self._need_connection()
+        if self._mode is not ArmMode.READY:
+            raise DeviceFault(f"the arm is in {self._mode.value}: look at the cell, clear the contact, then recover")
+        if self.moving:
+            raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it")
+
+
+_GAINS = (_POSITION_GAIN,) * 6
+
+
+def _check_range(what: str, value: float, high: float, unit: str) -> None:
+    if not math.isfinite(value) or not 0 < value <= high:
+        raise UnsafeMotion(f"{what} {value} {unit} is outside the controller's range of above 0 to {high:g} {unit}")

@@ -1,0 +1,59 @@
+"""The entry point `twin` of the group `robotcell.backends`. Physics and rendering are imported when it connects."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from robotcell.cell import Cell
+from sim_twin.noise import NoiseOptions
+
+if TYPE_CHECKING:
+    from robotcell.config import CellConfig
+
+
+class TwinOptions(BaseModel):
+    """`backend.options` of a twin.
+
+    Attributes:
+        scene: name of a built-in scene, or path of a scene file.
+        objects: how many objects a random scene has.
+        seed: of the scene and of the camera's noise; the same seed gives the same job.
+        meshes: folder of the OBJ files that a scene file names.
+        noise: what the camera adds to the truth.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene: str = "random"
+    objects: Annotated[int, Field(ge=1, le=60)] = 10
+    seed: Annotated[int, Field(ge=0)] = 0
+    meshes: Path | None = None
+    noise: NoiseOptions = NoiseOptions()
+
+
+class TwinBackend:
+    """A cell whose devices share one simulated world."""
+
+    Options: type[BaseModel] = TwinOptions
+
+    @staticmethod
+    def open(config: CellConfig) -> Cell:
+        """The twin of a configuration, not yet connected."""
+        from sim_twin.arm import TwinArm
+        from sim_twin.camera import TwinCamera
+        from sim_twin.clock import TwinClock
+        from sim_twin.gripper import TwinGripper
+        from sim_twin.world import World
+
+        options = TwinOptions.model_validate(config.backend.options)
+        world = World(config, options)
+        return Cell(
+            config,
+            TwinArm(world),
+            TwinGripper(world),
+            TwinCamera(world, config.camera, options.noise, options.seed),
+            TwinClock(world),
+        )

@@ -1,0 +1,144 @@
+"""The twin's RG2: two coupled cranks driven at a constant tip speed with a torque that gives the commanded force."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from robotcell import linkage
+from robotcell.errors import ConnectionLost, UnsafeMotion
+from robotcell.interfaces import GripperState
+from sim_twin import robot_model
+from sim_twin.world import STEP_S
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
+    from robotcell.geometry import Array
+    from sim_twin.world import World
+
+# Opening speed of the tips. Assumed: between the 55 and 184 mm/s per finger pair of OnRobot's data sheet for the RG2.
+WIDTH_SPEED_M_S = 0.11
+# The fingers are where they should be within this.
+_REACHED_M = 0.0002
+# Stopped short of the commanded width by more than this, the fingers hold something.
+GRIP_TOLERANCE_M = 0.001
+# Slower than this for that many steps, the fingers were stopped.
+_STILL_M_S = 0.004
+_STILL_STEPS = 12
+# The worm drive cannot be pushed back: at rest the cranks hold with this torque.
+_HOLDING_TORQUE_NM = 20.0
+# Share of the remaining way that the fingers may cover within a step, so that they do not overshoot.
+_APPROACH = 0.3
+
+
+class TwinGripper:
+    """The `Gripper` of a world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._connected = False
+        self._cranks: list[int] = []
+        self._target_m = 0.0
+        self._force_n = 0.0
+        self._driving = False
+        self._still_steps = 0
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def connect(self) -> None:
+        """Attach to the world and hold the fingers where they are. Does nothing when connected."""
+        if self._connected:
+            return
+        self._world.attach(self)
+        self._cranks = self._world.joint_index((robot_model.LEFT_CRANK, robot_model.RIGHT_CRANK))
+        self._connected = True
+        self.stop()
+        self._world.add_controller(self._control)
+
+    def close(self) -> None:
+        """Stop the fingers and let the world go. Idempotent."""
+        if self._connected:
+            self.stop()
+            self._world.remove_controller(self._control)
+            self._connected = False
+            self._world.detach(self)
+
+    def state(self) -> GripperState:
+        """The state after the last step."""
+        self._need_connection()
+        width = _width(self._world.joint_states(self._cranks)[0])
+        stopped = self._still_steps >= _STILL_STEPS
+        return GripperState(
+            t=self._world.time_s,
+            width_m=width,
+            busy=self._driving and not stopped,
+            grip_detected=self._driving and stopped and abs(width - self._target_m) > GRIP_TOLERANCE_M,
+        )
+
+    def start_width(self, width_m: float, force_n: float) -> None:
+        """Start moving the fingers; see `Gripper`.
+
+        Raises:
+            UnsafeMotion: width or force are outside the RG2's range.
+        """
+        self._need_connection()
+        _check_range("width", 1000 * width_m, 1000 * linkage.MIN_WIDTH_M, 1000 * linkage.MAX_WIDTH_M, "mm")
+        _check_range("force", force_n, linkage.MIN_FORCE_N, linkage.MAX_FORCE_N, "N")
+        if (width_m, force_n) != (self._target_m, self._force_n):
+            self._target_m, self._force_n = width_m, force_n
+            self._driving = True
+            self._still_steps = 0
+
+    def stop(self) -> None:
+        """Hold the fingers where they are."""
+        self._need_connection()
+        angles, _ = self._world.joint_states(self._cranks)
+        self._target_m = min(max(_width(angles), linkage.MIN_WIDTH_M), linkage.MAX_WIDTH_M)
+        self._force_n = 0.0
+        self._hold()
+
+    def _control(self) -> None:
+        """One control period: drive the cranks towards the commanded width."""
+        if not self._driving:
+            return
+        angles, rates = self._world.joint_states(self._cranks)
+        width, angle = _width(angles), float(angles.mean())
+        way = self._target_m - width
+        if abs(way) < _REACHED_M:
+            self._hold()
+            return
+        # Half the opening changes by L cos(angle) per radian, so a tip force F needs the torque F L cos(angle).
+        lever = linkage.CRANK_LENGTH_M * math.cos(angle)
+        speed = math.copysign(min(WIDTH_SPEED_M_S, _APPROACH * abs(way) / STEP_S), way)
+        self._world.drive_speeds(self._cranks, (speed / (2 * lever),) * 2, (self._force_n * lever,) * 2)
+        still = abs(float(rates.sum())) * lever < _STILL_M_S
+        self._still_steps = self._still_steps + 1 if still else 0
+
+    def _hold(self) -> None:
+        self._driving = False
+        self._still_steps = 0
+        angle = linkage.crank_angle(self._target_m)
+        self._world.drive_positions(self._cranks, (angle,) * 2, (_HOLDING_TORQUE_NM,) * 2, (0.5,) * 2)
+
+    def _need_connection(self) -> None:
+        if not self._connected:
+            raise ConnectionLost("the twin's gripper is not connected: connect it first")
+
+
+def _width(angles: Array) -> float:
+    return 0.5 * sum(linkage.width_at(float(angle)) for angle in angles)
+
+
+def _check_range(what: str, value: float, low: float, high: float, unit: str) -> None:
+    if not math.isfinite(value) or not low <= value <= high:
+        raise UnsafeMotion(f"gripper {what} {value:g} {unit} is outside the RG2's range of {low:g} to {high:g} {unit}")
