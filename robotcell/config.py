@@ -102,7 +102,8 @@ class KeepOut(_Table):
 class Motion(_Table):
     """How the arm moves. Speeds are those of the leading joint and of the tcp."""
 
-    home_q: tuple[float, float, float, float, float, float] = (-0.75, -1.90, 1.75, -1.42, -1.5708, 0.0)
+    # Tool upright beside the workspace, next to the bin: arm and gripper are 0.1 m out of the view of the workspace.
+    home_q: tuple[float, float, float, float, float, float] = (-0.8370, -1.4768, 1.2793, -1.3733, -1.5708, 0.7338)
     joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 1.5
     # Universal Robots' default for movej.
     joint_acceleration_rad_s2: Annotated[float, Field(gt=0, le=40)] = 1.4
