@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Protocol
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -25,9 +26,9 @@ STEPS_PER_S = 240
 FRAMES_PER_S = 30
 _STEPS_PER_FRAME = STEPS_PER_S // FRAMES_PER_S
 
-# The field of view of a D415's colour stream is 69.3 x 42.5 degrees at 16:9 (datasheet 69.4 x 42.5; a unit read out
-# in librealsense issue 4179), which is a focal length of 926 px at 1280x720. 640x480 is a crop of the same image,
-# scaled by 2/3. Principal points of units differ by some pixels from the middle.
+# A D415's colour stream sees 69.3 x 42.5 degrees at 16:9 (datasheet 69 x 42; read from a unit in
+# librealsense issue 4179): a focal length of 926 px at 1280x720. 640x480 is cut out of the same image and
+# scaled by 2/3. The principal points of units lie some pixels off the middle.
 MODES = {
     "640x480": Intrinsics(640, 480, 617.3, 617.3, 320.0, 240.0),
     "1280x720": Intrinsics(1280, 720, 926.0, 926.0, 640.0, 360.0),
@@ -42,10 +43,12 @@ _AMBIENT = 0.5
 
 
 class Visual(Mesh, Protocol):
-    """A mesh of one colour, (3,) uint8 RGB."""
+    """A mesh of one colour."""
 
     @property
-    def color(self) -> npt.NDArray[np.uint8]: ...
+    def color(self) -> npt.NDArray[np.uint8]:
+        """(3,) RGB under full light."""
+        ...
 
 
 class World(Protocol):
@@ -80,9 +83,9 @@ class World(Protocol):
 class TwinCamera:
     """A `Camera` that looks at a simulated world with the resolution, rate and errors of a D415.
 
-    `connect()` lets the frames pass in which automatic exposure settles, as a driver of the device does. Frames come
-    at 30 Hz of simulated time: `read()` lets the world run on to the next one. The frame number counts the frames
-    of simulated time since the world began.
+    Frames come at 30 Hz of simulated time: `read()` lets the world run on by one frame. `connect()` lets the
+    frames pass in which automatic exposure settles, as a driver of the device does. The frame number counts
+    from the beginning of the world.
 
     Args:
         world: what there is to see.
@@ -147,14 +150,21 @@ class TwinCamera:
             self._incidence_cos(hits),
             self._intrinsics,
             self._noise,
-            self._seed,
-            number,
+            seed=self._seed,
+            frame=number,
         )
-        color = degrade_color(self._color(hits), self._noise, self._seed, number, t, number - first_frame)
+        color = degrade_color(
+            self._color(hits),
+            self._noise,
+            seed=self._seed,
+            frame=number,
+            t=t,
+            frames_since_start=number - first_frame,
+        )
         return RgbdFrame(t=t, number=number, color=color, depth_m=depth, intrinsics=self._intrinsics)
 
     def render_truth(self) -> tuple[npt.NDArray[np.float32], Indices]:
-        """What is really in front of the camera now; for scoring, training labels and tests, never for a decision.
+        """What is really in front of the camera now: for scores, labels and tests, never for a decision.
 
         Returns:
             Depth (H, W) [m] along the optical axis, 0 = nothing, and the index (H, W) into `world.visuals()`,
@@ -192,11 +202,17 @@ class TwinCamera:
     def _incidence_cos(self, hits: Hits) -> npt.NDArray[np.float32]:
         """(H, W): the distance to a triangle's plane over the distance along the ray, 0 for nothing."""
         along_ray = hits.depth_m * self._pixel_range
-        return np.divide(hits.range_of[hits.triangle], along_ray, out=along_ray, where=along_ray > 0)
+        return np.asarray(
+            np.divide(np.take(hits.range_of, hits.triangle), along_ray, out=along_ray, where=along_ray > 0)
+        )
 
     def _color(self, hits: Hits) -> npt.NDArray[np.uint8]:
         """(H, W, 3): each triangle has one shade, by how it faces the lamps; black for nothing."""
         palette = np.array([*(visual.color for visual in self._cast_visuals), (0, 0, 0)], dtype=np.float64)
         shade = _AMBIENT + (1 - _AMBIENT) * np.maximum(hits.normal_of @ _LIGHT, 0)
-        of_triangle = np.rint(palette[hits.visual_of] * shade[:, None]).astype(np.uint8)
-        return of_triangle[hits.triangle]
+        # Four bytes for each triangle, so that a pixel is fetched as one number.
+        of_triangle = np.zeros((len(shade), 4), dtype=np.uint8)
+        of_triangle[:, :3] = np.rint(palette[hits.visual_of] * shade[:, None])
+        pixels = np.take(of_triangle.view(np.uint32)[:, 0], hits.triangle)
+        image = pixels.view(np.uint8).reshape(*pixels.shape, 4)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), dtype=np.uint8)

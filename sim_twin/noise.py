@@ -1,39 +1,43 @@
 """What a D415 makes of a perfect image: the errors of its stereo depth and of its colour sensor.
 
-Depth is disturbed where the device errs, in disparity d = f b / z, so that the error in depth grows with z^2 by
-itself: dz = z^2 / (f b) dd. Each part can be switched off, and draws from a stream of its own that depends on the
-seed and the frame number alone: the same seed gives the same frame, and switching one part off leaves the others as
-they are.
+Depth is disturbed where the device errs, in disparity d = f b / z, so that its error grows with the square of
+the distance by itself: dz = z^2 / (f b) dd. Each part can be switched off, and draws from a stream of its own
+that depends on the seed and the frame number alone: the same seed gives the same frame, and switching one part
+off leaves the others as they are.
 
 Sources:
-    [1] Intel RealSense D400 series datasheet: baseline, minimum depth, invalid depth band (section 4), fill rate.
-    [2] Grunnet-Jepsen et al., "Best-known-methods for tuning Intel RealSense D415 and D435 depth cameras": depth
-        error z^2 subpixel / (f b), 1 mm depth unit, holes on one side of near objects.
+    [1] Intel RealSense D400 series datasheet: baseline, minimum depth, invalid depth band, fill rate.
+    [2] Grunnet-Jepsen et al., "Tuning depth cameras for best performance" (Intel): depth error
+        z^2 subpixel / (f b), depth unit of 1 mm; holes lie left of near objects (librealsense issue 13475).
     [3] The camera's makers in librealsense issue 3904: subpixel error 0.08 px in use, 0.032 px at best.
-    [4] Keselman et al. 2017, "Intel RealSense stereoscopic depth cameras": matching by census windows with
-        subpixel interpolation; errors that neighbouring pixels share.
-    [5] Nguyen et al. 2012, "Modeling Kinect sensor noise": edges wander by about 0.8 px whatever the distance;
+    [4] Keselman et al. 2017, "Intel RealSense stereoscopic depth cameras": matching by windows, so that
+        neighbours err alike and windows across an edge blend or choose a side.
+    [5] Nguyen et al. 2012, "Modeling Kinect sensor noise": edges wander by about 0.8 px at any distance, and
         returns fail beyond about 70 degrees of incidence.
-    [6] EMVA standard 1288: variance of a pixel = read noise + gain * signal.
-Numbers without a source here are marked as assumed.
+    [6] EMVA standard 1288: the variance of a pixel is read noise plus gain times signal.
+Numbers that no source gives are marked as assumed.
 """
 
 from __future__ import annotations
 
+import functools
 import math
+from statistics import NormalDist
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
-from robotcell.interfaces import Intrinsics
+if TYPE_CHECKING:
+    from robotcell.interfaces import Intrinsics
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
-# [1] Distance between the two imagers, and of the left one to the right of the colour sensor (factory extrinsics of
-# D415 units lie within a millimetre of it). Depth is reported in the frame of the colour sensor.
+# [1] Distance between the two imagers; and how far the left one is to the right of the colour sensor, in
+# whose frame depth is reported (about 15 mm in the factory extrinsics of D415 units).
 BASELINE_M = 0.055
 COLOR_TO_LEFT_M = 0.015
 # [3]
@@ -67,7 +71,7 @@ _LENS_SIGMA_PX = 0.6
 _WHITE_BALANCE_RMS = 0.02
 _EXPOSURE_RMS = 0.03
 _DRIFT_PERIODS_S = (23.0, 71.0, 311.0)
-# Automatic exposure starts dark and settles with this time constant (assumed; the SDK's examples skip 30 frames).
+# Automatic exposure starts dark and settles with this time constant (assumed); drivers commonly skip 30 frames.
 _EXPOSURE_START = 0.25
 _EXPOSURE_FRAMES = 5.0
 WARM_UP_FRAMES = 30
@@ -93,6 +97,7 @@ def degrade_depth(
     incidence_cos: Floats,
     intrinsics: Intrinsics,
     options: NoiseOptions,
+    *,
     seed: int,
     frame: int,
 ) -> Floats:
@@ -127,7 +132,7 @@ def degrade_depth(
         np.rint(disparity, out=disparity)
         disparity *= np.float32(DISPARITY_STEP_PX)
     seen &= disparity > 0
-    depth = np.divide(focal_baseline, disparity, out=np.zeros_like(depth_m), where=seen)
+    depth: Floats = np.divide(focal_baseline, disparity, out=np.zeros_like(depth_m), where=seen)
     if options.quantisation:
         depth *= np.float32(1 / DEPTH_UNIT_M)
         np.rint(depth, out=depth)
@@ -136,7 +141,7 @@ def degrade_depth(
 
 
 def degrade_color(
-    color: Bytes, options: NoiseOptions, seed: int, frame: int, t: float, frames_since_start: int
+    color: Bytes, options: NoiseOptions, *, seed: int, frame: int, t: float, frames_since_start: int
 ) -> Bytes:
     """The colour image that a D415 delivers instead of the true one.
 
@@ -155,9 +160,7 @@ def degrade_color(
         gains *= exposure(frames_since_start)
     if not np.all(gains == 1):
         counts = np.arange(256)[:, None] * gains
-        color = np.asarray(
-            cv2.LUT(color, np.clip(np.rint(counts), 0, 255).astype(np.uint8)[None]), dtype=np.uint8
-        )
+        color = np.asarray(cv2.LUT(color, np.clip(np.rint(counts), 0, 255).astype(np.uint8)[None]), dtype=np.uint8)
     if options.color_noise:
         color = _sensor_noise(color, _stream(seed, frame, 3))
     return color
@@ -183,9 +186,9 @@ def _stream(seed: int, frame: int, part: int) -> np.random.Generator:
 def _correlated_normal(shape: tuple[int, ...], sigma_px: float, rng: np.random.Generator) -> Floats:
     """A field of unit variance whose values agree over a few pixels: white noise under a Gaussian window."""
     size = 2 * math.ceil(2 * sigma_px) + 1
-    kernel = cv2.getGaussianKernel(size, sigma_px, cv2.CV_32F)
-    # In two dimensions the window reduces the standard deviation by the sum of squares of one.
-    kernel /= np.sqrt(np.sum(kernel**2))
+    kernel = np.asarray(cv2.getGaussianKernel(size, sigma_px), dtype=np.float64)
+    # A window whose squares sum to one keeps the variance.
+    kernel /= np.linalg.norm(kernel)
     white = rng.standard_normal(shape, dtype=np.float32)
     return np.asarray(cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel), dtype=np.float32)
 
@@ -193,8 +196,8 @@ def _correlated_normal(shape: tuple[int, ...], sigma_px: float, rng: np.random.G
 def _shadow(disparity: Floats) -> npt.NDArray[np.bool_]:
     """What the colour sensor sees and the right imager does not: left of near objects, and the left border.
 
-    The right imager sees column u at u - d. A point is hidden where something to its right appears to its left
-    there. Points that are seen past the far side of a thin object count as hidden too, since matching along a row
+    The right imager sees column u at u - d. A point is hidden where something that is to its right appears to
+    its left there. Points that are seen past a thin object count as hidden too, since matching along a row
     keeps the order of columns.
     """
     scale = np.float32((BASELINE_M + COLOR_TO_LEFT_M) / BASELINE_M)
@@ -210,9 +213,7 @@ def _dropped(incidence_cos: Floats, rng: np.random.Generator) -> npt.NDArray[np.
     blobs = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_NEAREST)
     start, end = math.cos(_GRAZING_START), math.cos(_GRAZING_END)
     slope = 2 * _SPECKLE_SIGMAS / (start - end)
-    limit = np.minimum(
-        (incidence_cos - np.float32(end)) * np.float32(slope) - _SPECKLE_SIGMAS, _SPECKLE_SIGMAS
-    )
+    limit = np.minimum((incidence_cos - np.float32(end)) * np.float32(slope) - _SPECKLE_SIGMAS, _SPECKLE_SIGMAS)
     return np.asarray(blobs > limit)
 
 
@@ -222,14 +223,13 @@ def _bleed_edges(disparity: Floats, rng: np.random.Generator) -> None:
     window = np.ones((2 * _EDGE_RADIUS_PX + 1,) * 2, np.uint8)
     front = np.asarray(cv2.dilate(disparity, window))
     back = np.asarray(cv2.erode(disparity, window))
-    rows, columns = np.nonzero(front - back > _EDGE_STEP_PX)
+    # On a slanted plane the middle pixel is half-way between the two, at a step it is one of them.
+    rows, columns = np.nonzero(np.abs(2 * disparity - front - back) > _EDGE_STEP_PX)
     # One draw for each patch of 4 x 4 pixels: an edge wanders in waves, not pixel by pixel.
     patches = (2, (height + 3) // 4, (width + 3) // 4)
     shift = np.rint(_LATERAL_RMS_PX * rng.standard_normal(patches, dtype=np.float32)).astype(np.intp)
     row_shift, column_shift = shift[:, rows // 4, columns // 4]
-    wandered = disparity[
-        np.clip(rows + row_shift, 0, height - 1), np.clip(columns + column_shift, 0, width - 1)
-    ]
+    wandered = disparity[np.clip(rows + row_shift, 0, height - 1), np.clip(columns + column_shift, 0, width - 1)]
     share = rng.random(len(rows), dtype=np.float32)
     between = share * front[rows, columns] + (1 - share) * back[rows, columns]
     hangs = (rng.random(len(rows)) < _FLYING_SHARE) & (back[rows, columns] > 0)
@@ -238,10 +238,18 @@ def _bleed_edges(disparity: Floats, rng: np.random.Generator) -> None:
 
 def _sensor_noise(color: Bytes, rng: np.random.Generator) -> Bytes:
     """Blur of the lens, then noise whose variance grows with the signal."""
-    blurred = np.asarray(cv2.GaussianBlur(color, (3, 3), _LENS_SIGMA_PX), dtype=np.uint8)
-    deviation = np.sqrt(_READ_NOISE**2 + _SHOT_GAIN * np.arange(256)).astype(np.float32)
-    noisy = rng.standard_normal(color.shape, dtype=np.float32)
-    noisy *= deviation[blurred]
-    noisy += blurred
-    np.rint(noisy, out=noisy)
-    return np.clip(noisy, 0, 255, out=noisy).astype(np.uint8)
+    # Pairs of bytes, drawn and seen, that read as an index into the table.
+    pairs = np.empty((*color.shape, 2), dtype=np.uint8)
+    pairs[..., 0] = np.frombuffer(rng.bytes(color.size), dtype=np.uint8).reshape(color.shape)
+    pairs[..., 1] = cv2.GaussianBlur(color, (3, 3), _LENS_SIGMA_PX)
+    return np.take(_noisy_counts(), pairs.view("<u2")[..., 0])
+
+
+@functools.cache
+def _noisy_counts() -> Bytes:
+    """(65536,) noisy count for each true count (high byte) and each of 256 equal chances (low byte)."""
+    signal = np.arange(256.0)[:, None]
+    normal = np.array([NormalDist().inv_cdf((draw + 0.5) / 256) for draw in range(256)])
+    noisy = signal + np.sqrt(_READ_NOISE**2 + _SHOT_GAIN * signal) * normal
+    counts: Bytes = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+    return counts.ravel()

@@ -1,4 +1,4 @@
-"""What a pinhole camera at a fixed place sees of a list of meshes: one ray per pixel, cast by Open3D (Embree)."""
+"""What a pinhole camera at a fixed place sees of a list of meshes: one ray per pixel, cast by Open3D."""
 
 from __future__ import annotations
 
@@ -27,13 +27,17 @@ _LIBUSB = "libusb-1.0.so.0"
 
 
 class Mesh(Protocol):
-    """A rigid triangle mesh in the frame of its link: vertices (N, 3) [m], triangles (M, 3) of vertex indices."""
+    """A rigid mesh of triangles, which may wind either way."""
 
     @property
-    def vertices(self) -> Floats: ...
+    def vertices(self) -> Floats:
+        """(N, 3) [m] in the frame of its link."""
+        ...
 
     @property
-    def triangles(self) -> Indices: ...
+    def triangles(self) -> Indices:
+        """(M, 3) indices of vertices."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Hits:
         triangle: (H, W) int32, index into the two tables below, -1 = nothing (which is their last row).
         visual_of: (T + 1,) int32, the mesh that each triangle belongs to; -1 in the last row.
         normal_of: (T + 1, 3) float32, unit normals in base on the side of the camera; 0 in the last row.
-        range_of: (T + 1,) float32, distance [m] from the camera to the plane of each triangle; 0 in the last row.
+        range_of: (T + 1,) float32, distance [m] from camera to plane of each triangle; 0 in the last row.
     """
 
     depth_m: Floats
@@ -66,8 +70,8 @@ class Hits:
 class RayCaster:
     """Casts the rays of one camera.
 
-    Embree cannot move what it has indexed, so each frame transforms all vertices and builds a new scene of one
-    geometry, which takes 1 to 3 ms for the few thousand triangles of the cell.
+    Open3D cannot move what it has indexed, so each frame transforms all vertices and builds a new scene of
+    one geometry: 1 to 3 ms for the few thousand triangles of the cell.
 
     Args:
         meshes: what there is to see.
@@ -76,9 +80,7 @@ class RayCaster:
         threads: that Embree may use.
     """
 
-    def __init__(
-        self, meshes: Sequence[Mesh], intrinsics: Intrinsics, T_base_camera: Array, threads: int = 2
-    ) -> None:
+    def __init__(self, meshes: Sequence[Mesh], intrinsics: Intrinsics, T_base_camera: Array, threads: int = 2) -> None:
         self._open3d = load_open3d()
         self._threads = threads
         counts = [len(mesh.vertices) for mesh in meshes]
@@ -131,7 +133,7 @@ class RayCaster:
 def load_open3d() -> Any:
     """The module open3d, which needs libusb at import even where no camera is used.
 
-    Where the system has no libusb, the one in the `libusb-package` wheel is loaded for all libraries of the process.
+    Where the system has no libusb, the one in the `libusb-package` wheel is loaded for the whole process.
 
     Raises:
         ConfigError: open3d or libusb is not installed.
@@ -155,8 +157,8 @@ def _load_packaged_libusb() -> None:
         ctypes.CDLL(str(package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError) as error:
         raise ConfigError(
-            f"the twin's camera needs {_LIBUSB}, and neither the system nor the package libusb-package has it "
-            f"({error}); install the twin: pip install 'robotcell[twin]'"
+            f"the twin's camera needs {_LIBUSB}; neither the system nor the package libusb-package has it "
+            f"({error}): install the twin: pip install 'robotcell[twin]'"
         ) from error
 
 
