@@ -108,7 +108,7 @@ class Guard:
         off = float(np.abs(state.q - plan.q_start).max())
         if off > _START_TOLERANCE_RAD:
             raise UnsafeMotion(
-                f"{plan.label}: a joint is {off:.3f} rad from the start of the plan; plan again from the measured joints"
+                f"{plan.label}: a joint is {off:.3f} rad from the start of the plan: plan again from measured joints"
             )
 
     def check(self, state: ArmState, now: float) -> None:

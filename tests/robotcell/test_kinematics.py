@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from robotcell import kinematics
+
+joints = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
+
+
+def test_flange_pose_matches_the_controller_convention() -> None:
+    # The flange position that the controller's own forward kinematics gives for these joints.
+    q = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
+    np.testing.assert_allclose(kinematics.forward(q)[:3, 3], (-0.4922, -0.1334, 0.4878), atol=1e-4)
+
+
+@given(joints)
+def test_inverse_returns_the_nearest_solution(q: np.ndarray) -> None:
+    assume(kinematics.distance_to_singularity(q) > 0.02)
+    solution = kinematics.inverse(kinematics.forward(q), q)
+    assert solution is not None
+    np.testing.assert_allclose(solution, q, atol=1e-6)
+
+
+@given(joints, st.integers(0, 5))
+def test_jacobian_is_the_derivative(q: np.ndarray, joint: int) -> None:
+    h = 1e-6
+    step = h * np.eye(6)[joint]
+    before, after = kinematics.forward(q - step), kinematics.forward(q + step)
+    J = kinematics.jacobian(q)[:, joint]
+    np.testing.assert_allclose((after - before)[:3, 3] / (2 * h), J[:3], atol=1e-6)
+    spin = (after - before)[:3, :3] / (2 * h) @ kinematics.forward(q)[:3, :3].T
+    np.testing.assert_allclose((spin[2, 1], spin[0, 2], spin[1, 0]), J[3:], atol=1e-6)
+
+
+def test_the_stretched_arm_is_singular() -> None:
+    assert kinematics.distance_to_singularity((0.0, -1.0, 0.0, -1.0, -1.57, 0.0)) < 1e-9
+    assert kinematics.distance_to_singularity((0.0, -1.57, 1.57, -1.57, -1.57, 0.0)) > 0.05
+
+
+def test_joint_angles_stay_in_the_turn_they_are_in() -> None:
+    q = np.array([0.3, -1.8, 1.9, -1.6, -1.57, 6.0])
+    solution = kinematics.inverse(kinematics.forward(q), q)
+    assert solution is not None
+    np.testing.assert_allclose(solution, q, atol=1e-6)
+
+
+def test_a_pose_out_of_reach_has_no_solution() -> None:
+    T = kinematics.forward((0.0, -1.57, 1.57, -1.57, -1.57, 0.0))
+    T[0, 3] = -1.5
+    assert kinematics.inverse(T, np.zeros(6)) is None
+
+
+def test_a_path_says_where_it_leaves_the_reach() -> None:
+    q = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+    path = np.tile(kinematics.forward(q), (3, 1, 1))
+    path[1, 0, 3] = -1.5
+    with pytest.raises(ValueError, match=r"cannot reach x -1\.500"):
+        kinematics.inverse_along(path, q, max_step=0.3)
+
+
+def test_a_path_through_a_jump_is_refused() -> None:
+    q = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+    path = np.stack([kinematics.forward(q), kinematics.forward(q + 0.5)])
+    with pytest.raises(ValueError, match="singularity"):
+        kinematics.inverse_along(path, q, max_step=0.3)

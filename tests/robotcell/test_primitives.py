@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robotcell import kinematics, linkage
+from robotcell.config import CellConfig
+from robotcell.decision import Primitive
+from robotcell.errors import UnsafeMotion
+from robotcell.primitives import Grip, JointMove, LinearMove, MotionPlan, plan_action
+from tests.robotcell.maps import action, heightmap
+
+CONFIG = CellConfig()
+HOME = np.array(CONFIG.motion.home_q)
+xs = st.floats(CONFIG.workspace.x[0], CONFIG.workspace.x[1])
+ys = st.floats(CONFIG.workspace.y[0], CONFIG.workspace.y[1])
+surfaces = st.floats(0.0, 0.15)
+rotations = st.integers(0, 15)
+
+
+def linear(plan: MotionPlan, label: str) -> LinearMove:
+    (step,) = (step for step in plan.steps if isinstance(step, LinearMove) and step.label == label)
+    return step
+
+
+@given(xs, ys, surfaces, rotations)
+def test_a_grasp_closes_below_the_surface_and_above_the_table(x: float, y: float, z: float, rotation: int) -> None:
+    plan = plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG)
+    T = linear(plan, "descend guarded").T_base_tcp
+    np.testing.assert_allclose(T[:2, 3], (x, y), atol=1e-6)
+    assert T[2, 3] == pytest.approx(max(z - 0.04, CONFIG.gripper.tip_clearance_m), abs=1e-6)
+    # The tool points down, and its jaw closes along theta, one way round or the other.
+    np.testing.assert_allclose(T[:3, 2], (0, 0, -1), atol=1e-6)
+    theta = 2 * math.pi * rotation / 16
+    assert abs(T[:3, 0] @ (math.cos(theta), math.sin(theta), 0)) == pytest.approx(1, abs=1e-6)
+
+
+@given(xs, ys, surfaces, rotations)
+def test_a_grasp_lifts_straight_up_by_the_approach_height(x: float, y: float, z: float, rotation: int) -> None:
+    plan = plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG)
+    down, up = linear(plan, "descend guarded").T_base_tcp, linear(plan, "lift").T_base_tcp
+    np.testing.assert_allclose(up[:3, 3] - down[:3, 3], (0, 0, CONFIG.motion.approach_m), atol=1e-6)
+
+
+def test_the_unguarded_descent_ends_above_what_stands_there() -> None:
+    heights = np.zeros(CONFIG.workspace.shape, np.float32)
+    x, y = CONFIG.workspace.position(112, 112)
+    heights[100:104, 110:114] = 0.08  # a neighbour under the open gripper
+    plan = plan_action(action(Primitive.GRASP, x, y, 0.05, 0), heightmap(heights), HOME, CONFIG)
+    tips = linear(plan, "descend").T_base_tcp[2, 3] + linkage.tip_retraction(CONFIG.gripper.preshape_m)
+    assert tips == pytest.approx(0.08 + 0.02, abs=1e-3)
+
+
+@given(xs, ys, rotations)
+def test_a_push_goes_straight_and_stays_in_the_workspace(x: float, y: float, rotation: int) -> None:
+    try:
+        plan = plan_action(action(Primitive.PUSH, x, y, 0.05, rotation), heightmap(), HOME, CONFIG)
+    except UnsafeMotion as error:
+        assert "inside the workspace" in str(error)
+        return
+    start, end = linear(plan, "descend guarded").T_base_tcp, linear(plan, "push").T_base_tcp
+    assert start[2, 3] == end[2, 3] == pytest.approx(0.025, abs=1e-6)
+    travel = end[:2, 3] - start[:2, 3]
+    assert np.linalg.norm(travel) <= CONFIG.motion.push_m + 1e-6
+    for T in (start, end):
+        assert CONFIG.workspace.x[0] - 1e-6 <= T[0, 3] <= CONFIG.workspace.x[1] + 1e-6
+        assert CONFIG.workspace.y[0] - 1e-6 <= T[1, 3] <= CONFIG.workspace.y[1] + 1e-6
+    (grip,) = (step for step in plan.steps if isinstance(step, Grip))
+    assert grip.width_m == 0.0
+
+
+def test_every_plan_ends_at_home() -> None:
+    for primitive in Primitive:
+        plan = plan_action(action(primitive, -0.5, 0.0, 0.05, 3), heightmap(), HOME, CONFIG)
+        last = plan.steps[-1]
+        assert isinstance(last, JointMove)
+        np.testing.assert_array_equal(last.q, HOME)
+
+
+def test_a_target_out_of_reach_is_refused() -> None:
+    with pytest.raises(UnsafeMotion, match=r"cannot reach x -1\.500"):
+        plan_action(action(Primitive.GRASP, -1.5, 0.0, 0.05, 0), heightmap(), HOME, CONFIG)
+
+
+def test_joint_targets_stay_near_home() -> None:
+    plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, CONFIG)
+    for step in plan.steps:
+        if isinstance(step, JointMove):
+            assert np.abs(step.q - HOME).max() < np.pi
+            assert (np.abs(step.q) < kinematics.JOINT_LIMIT).all()

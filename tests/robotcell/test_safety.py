@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robotcell import kinematics
+from robotcell.config import CellConfig
+from robotcell.decision import Primitive
+from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
+from robotcell.interfaces import ArmMode, ArmState
+from robotcell.primitives import (
+    T_FLANGE_TCP,
+    Grip,
+    JointMove,
+    LinearMove,
+    MotionPlan,
+    plan_action,
+    plan_retreat,
+    tool_down,
+)
+from robotcell.safety import Guard, check_plan
+from tests.robotcell.maps import action, heightmap
+
+CONFIG = CellConfig()
+HOME = np.array(CONFIG.motion.home_q)
+
+
+def plan_of(*steps: Any) -> MotionPlan:
+    return MotionPlan("test", HOME, steps)
+
+
+def joint_move(q: Any, speed: float = 1.0, acceleration: float = 1.0, load_m: float = 0.0) -> JointMove:
+    return JointMove("move", np.array(q), speed, acceleration, load_m)
+
+
+def above(x: float, y: float, z: float) -> JointMove:
+    """A joint move to a tool-down pose."""
+    q = kinematics.inverse(tool_down(x, y, z, 0.0) @ np.linalg.inv(T_FLANGE_TCP), HOME)
+    assert q is not None
+    return joint_move(q)
+
+
+def to(x: float, y: float, z: float, speed: float = 0.2) -> LinearMove:
+    return LinearMove("line", tool_down(x, y, z, 0.0), speed, 1.0)
+
+
+def state(**changes: Any) -> ArmState:
+    measured = ArmState(
+        t=0.0,
+        q=HOME,
+        qd=np.zeros(6),
+        T_base_tcp=kinematics.forward(HOME) @ T_FLANGE_TCP,
+        wrench=np.zeros(6),
+        mode=ArmMode.READY,
+    )
+    return replace(measured, **changes)
+
+
+@given(
+    st.sampled_from(Primitive),
+    st.floats(CONFIG.workspace.x[0], CONFIG.workspace.x[1]),
+    st.floats(CONFIG.workspace.y[0], CONFIG.workspace.y[1]),
+    st.floats(0.0, 0.1),
+    st.integers(0, 15),
+)
+def test_every_action_in_the_workspace_has_a_safe_plan(
+    primitive: Primitive, x: float, y: float, z: float, rotation: int
+) -> None:
+    try:
+        plan = plan_action(action(primitive, x, y, z, rotation), heightmap(), HOME, CONFIG)
+    except UnsafeMotion as error:
+        assert primitive is Primitive.PUSH
+        assert "inside the workspace" in str(error)
+        return
+    assert check_plan(plan, CONFIG).plan is plan
+
+
+@pytest.mark.parametrize(
+    ("step", "reason"),
+    [
+        (joint_move([np.nan] * 6), "not six finite numbers"),
+        (joint_move([0.0] * 5), "not six finite numbers"),
+        (joint_move([*HOME[:5], 6.27]), r"joint 5 would turn to 6\.27 rad"),
+        (joint_move(HOME, speed=2.5), "joint speed 2.5 rad/s"),
+        (joint_move(HOME, acceleration=100.0), "joint acceleration 100"),
+        (joint_move(HOME, speed=0.0), "joint speed 0.0"),
+        (Grip("grip", 0.12, 20.0), r"width 120\.0 mm"),
+        (Grip("grip", 0.05, 50.0), r"force 50\.0 N"),
+        (LinearMove("line", np.full((4, 4), np.nan), 0.1, 1.0), "not a finite 4x4"),
+    ],
+)
+def test_a_step_outside_the_limits_is_refused(step: Any, reason: str) -> None:
+    with pytest.raises(UnsafeMotion, match=rf"test, step '\w+': .*{reason}"):
+        check_plan(plan_of(step), CONFIG)
+
+
+def test_a_line_below_the_table_is_refused() -> None:
+    with pytest.raises(UnsafeMotion, match=r"finger tips would be -?\d"):
+        check_plan(plan_of(above(-0.5, 0.0, 0.2), to(-0.5, 0.0, 0.001)), CONFIG)
+
+
+def test_a_line_out_of_the_box_is_refused() -> None:
+    with pytest.raises(UnsafeMotion, match="leave its box"):
+        check_plan(plan_of(above(-0.4, -0.4, 0.3), to(-0.4, -0.5, 0.3)), CONFIG)
+
+
+def test_a_line_out_of_reach_is_refused() -> None:
+    wide = CONFIG.model_copy(update={"limits": CONFIG.limits.model_copy(update={"x": (-3.0, 3.0)})})
+    with pytest.raises(UnsafeMotion, match="cannot reach|singularity"):
+        check_plan(plan_of(above(-0.6, 0.0, 0.3), to(-1.2, 0.0, 0.3)), wide)
+
+
+def test_a_line_into_the_bin_wall_is_refused() -> None:
+    x, y = CONFIG.bin.center
+    edge = y - CONFIG.bin.size[1] / 2
+    with pytest.raises(UnsafeMotion, match="keep-out 'bin'"):
+        check_plan(plan_of(above(x, edge, 0.3), to(x, edge, 0.05)), CONFIG)
+
+
+def test_a_configured_keep_out_is_kept_out_of() -> None:
+    shelf = {"name": "shelf", "x": (-0.55, -0.45), "y": (-0.05, 0.05), "z": (0.0, 0.15)}
+    config = CellConfig.model_validate({"keep_out": [shelf]})
+    plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
+    with pytest.raises(UnsafeMotion, match="keep-out 'shelf'"):
+        check_plan(plan, config)
+
+
+def test_a_load_needs_room_below() -> None:
+    shelf = {"name": "shelf", "x": (-0.60, -0.40), "y": (0.0, 0.05), "z": (0.0, 0.22)}
+    config = CellConfig.model_validate({"keep_out": [shelf]})
+    start, end = above(-0.5, -0.15, 0.3), above(-0.5, 0.15, 0.3)
+    check_plan(plan_of(start, end), config)
+    with pytest.raises(UnsafeMotion, match="keep-out 'shelf'"):
+        check_plan(plan_of(start, replace(end, load_m=0.12)), config)
+
+
+def test_an_arm_folded_into_itself_is_refused() -> None:
+    folded = HOME.copy()
+    folded[2] = 2.95
+    with pytest.raises(UnsafeMotion, match="touch"):
+        check_plan(plan_of(joint_move(folded)), CONFIG)
+
+
+def test_a_line_through_the_wrist_singularity_is_refused() -> None:
+    # With the fifth joint at zero the fourth and the sixth axis fall together.
+    q = HOME.copy()
+    q[4] = 0.3
+    T = kinematics.forward(q) @ T_FLANGE_TCP
+    past = HOME.copy()
+    past[4] = -0.3
+    T_past = kinematics.forward(past) @ T_FLANGE_TCP
+    wide = {"x": (-1, 1), "y": (-1, 1), "z": (0, 1.2)}
+    config = CellConfig.model_validate({"limits": wide})
+    T_goal = T.copy()
+    T_goal[:3, :3] = T_past[:3, :3]
+    with pytest.raises(UnsafeMotion, match="singularity|cannot reach"):
+        check_plan(plan_of(joint_move(q), LinearMove("line", T_goal, 0.1, 1.0)), config)
+
+
+def test_a_retreat_from_above_the_table_is_safe() -> None:
+    step = above(-0.5, 0.1, 0.01)
+    low = state(q=step.q, T_base_tcp=kinematics.forward(step.q) @ T_FLANGE_TCP)
+    plan = plan_retreat(low, CONFIG)
+    check_plan(plan, CONFIG)
+    first = plan.steps[0]
+    assert isinstance(first, LinearMove)
+    assert first.T_base_tcp[2, 3] > 0.15
+
+
+def test_a_plan_starts_where_the_arm_stands() -> None:
+    guard = Guard(CONFIG)
+    guard.check_start(state(), plan_of())
+    with pytest.raises(UnsafeMotion, match="plan again from measured joints"):
+        guard.check_start(state(q=HOME + 0.1), plan_of())
+    with pytest.raises(DeviceFault, match="emergency stop"):
+        guard.check_start(state(mode=ArmMode.EMERGENCY_STOP), plan_of())
+
+
+@pytest.mark.parametrize(
+    ("changes", "now", "error", "reason"),
+    [
+        ({}, 0.3, GuardTripped, r"0\.30 s old"),
+        ({"wrench": np.array([0.0, 0.0, 120.0, 0, 0, 0])}, 0.0, GuardTripped, "120 N"),
+        ({"qd": np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.5])}, 0.0, GuardTripped, r"2\.50 rad/s"),
+        ({"qd": np.array([2.0, 2.0, 0.0, 0.0, 0.0, 0.0])}, 0.0, GuardTripped, "tool moves at"),
+        ({"T_base_tcp": tool_down(-0.9, 0.0, 0.3, 0.0)}, 0.0, GuardTripped, "left its box"),
+        ({"mode": ArmMode.PROTECTIVE_STOP}, 0.0, DeviceFault, "protective stop"),
+    ],
+)
+def test_a_violation_latches_until_an_operator_clears_it(
+    changes: dict[str, Any], now: float, error: type[Exception], reason: str
+) -> None:
+    guard = Guard(CONFIG)
+    guard.check(state(), 0.0)
+    with pytest.raises(error, match=reason):
+        guard.check(state(**changes), now)
+    with pytest.raises(GuardTripped, match="recover"):
+        guard.check_start(state(), plan_of())
+    guard.clear()
+    guard.check_start(state(), plan_of())
