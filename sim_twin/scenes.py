@@ -1,12 +1,12 @@
-"""What stands on the twin's table when a job begins.
+"""What stands on the twin's table when a job begins: random drops, built-in arrangements, novel objects, files.
 
 Scenes are made in a frame of their own (x and y from the centre of the workspace, z from the table top) and
-placed into the workspace that is configured. Metres, radians, base frame.
+placed into the workspace that is configured. Metres, radians.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,15 +15,19 @@ from scipy.spatial.transform import Rotation
 from robotcell.errors import ConfigError
 from robotcell.geometry import make_transform
 from robotcell.palette import PALETTE
+from sim_twin.novel import novel_shapes
+from sim_twin.scene import Scene, SceneObject, place
+from sim_twin.scene_files import read_scene
 from sim_twin.shapes import BLOCK_NAMES, block
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from robotcell.config import Workspace
     from robotcell.geometry import Array
     from sim_twin.shapes import Shape
+
+__all__ = ["Scene", "SceneObject", "make_scene", "scene_names"]
 
 # Drops scatter over a square of this half width about the centre: half of the papers' 448 mm workspace.
 DROP_HALF_WIDTH_M = 0.112
@@ -31,38 +35,12 @@ DROP_HALF_WIDTH_M = 0.112
 _DROP_HEIGHT_M = 0.06
 _DROP_GAP_M = 0.005
 _DROP_CANDIDATES = 8
+_BUILT_IN = Path(__file__).parent / "scenes"
 
 
-@dataclass(frozen=True)
-class SceneObject:
-    """An object of a scene.
-
-    Attributes:
-        name: unique in its scene.
-        shape: what it is.
-        color: RGB, 0..255.
-        T_base_object: pose of the shape's frame.
-    """
-
-    name: str
-    shape: Shape
-    color: tuple[int, int, int]
-    T_base_object: Array
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A scene.
-
-    Attributes:
-        name: as it was asked for.
-        objects: in the order in which they are let go.
-        drop: whether the objects fall from where they are given; otherwise they stand there already.
-    """
-
-    name: str
-    objects: tuple[SceneObject, ...]
-    drop: bool
+def scene_names() -> list[str]:
+    """The names that `make_scene` knows without a file."""
+    return ["random", "novel", *sorted(path.stem for path in _BUILT_IN.glob("*.toml"))]
 
 
 def make_scene(
@@ -71,24 +49,32 @@ def make_scene(
     """Make the scene of that name.
 
     Args:
-        name: `random`.
-        count: number of objects, where the scene leaves it open.
-        seed: of the draw.
+        name: one of `scene_names()`, or the path of a scene file (see docs/scenes.md).
+        count: number of objects of `random` and `novel`; the other scenes have their own.
+        seed: of what those two draw.
         workspace: where the scene is put.
         table_height_m: z of the table top.
         meshes: folder with the OBJ files that a scene file names.
 
     Raises:
-        ConfigError: there is no such scene; the message lists what there is.
+        ConfigError: there is no such scene (the message lists what there is), or its file is malformed.
     """
     if count < 1:
         raise ConfigError(f"a scene needs at least one object; {count} were asked for")
+    rng = np.random.default_rng(seed)
     if name == "random":
-        rng = np.random.default_rng(seed)
         shapes = [block(BLOCK_NAMES[i]) for i in rng.integers(len(BLOCK_NAMES), size=count)]
         scene = drop_scene(name, shapes, rng)
+    elif name == "novel":
+        scene = drop_scene(name, novel_shapes(count, rng), rng)
+    elif name in scene_names():
+        scene = read_scene(_BUILT_IN / f"{name}.toml", None)
+    elif Path(name).is_file():
+        scene = read_scene(Path(name), meshes)
     else:
-        raise ConfigError(f"no scene is called {name!r}; there are random")
+        raise ConfigError(
+            f"no scene or scene file is called {name!r}; there are {', '.join(scene_names())}, or the path of a file"
+        )
     return place(scene, workspace, table_height_m)
 
 
@@ -111,15 +97,6 @@ def drop_scene(name: str, shapes: Sequence[Shape], rng: np.random.Generator) -> 
         T = make_transform(_random_rotation(rng), centre)
         objects.append(SceneObject(f"{color} {shape.name} {i + 1}", shape, PALETTE[color], T))
     return Scene(name, tuple(objects), drop=True)
-
-
-def place(scene: Scene, workspace: Workspace, table_height_m: float) -> Scene:
-    """The scene with its origin in the centre of the workspace, on the table top."""
-    origin = make_transform(np.eye(3), (sum(workspace.x) / 2, sum(workspace.y) / 2, table_height_m))
-    objects = tuple(
-        SceneObject(item.name, item.shape, item.color, origin @ item.T_base_object) for item in scene.objects
-    )
-    return Scene(scene.name, objects, scene.drop)
 
 
 def _colors(count: int, rng: np.random.Generator) -> list[str]:
