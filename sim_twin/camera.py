@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -11,7 +11,8 @@ import numpy.typing as npt
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import Intrinsics, RgbdFrame
 from sim_twin.noise import WARM_UP_FRAMES, NoiseOptions, degrade_color, degrade_depth
-from sim_twin.raycast import Hits, Indices, Mesh, RayCaster, ray_directions
+from sim_twin.raycast import Hits, Indices, RayCaster, load_open3d, ray_directions
+from sim_twin.world import STEP_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,11 +21,10 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from robotcell.config import CameraMount
-    from robotcell.geometry import Array
+    from sim_twin.world import Visual, World
 
-STEPS_PER_S = 240
 FRAMES_PER_S = 30
-_STEPS_PER_FRAME = STEPS_PER_S // FRAMES_PER_S
+_STEPS_PER_FRAME = round(1 / (FRAMES_PER_S * STEP_S))
 
 # A D415's colour stream sees 69.3 x 42.5 degrees at 16:9 (datasheet 69 x 42; read from a unit in
 # librealsense issue 4179): a focal length of 926 px at 1280x720. 640x480 is cut out of the same image and
@@ -40,44 +40,6 @@ _MAX_DEPTH_M = 10.0
 # Lamps above the cell: surfaces that face them are this much brighter than those that do not.
 _LIGHT = np.array([0.15, -0.25, 0.95]) / np.linalg.norm([0.15, -0.25, 0.95])
 _AMBIENT = 0.5
-
-
-class Visual(Mesh, Protocol):
-    """A mesh of one colour."""
-
-    @property
-    def color(self) -> npt.NDArray[np.uint8]:
-        """(3,) RGB under full light."""
-        ...
-
-
-class World(Protocol):
-    """What the camera needs of the simulated world."""
-
-    @property
-    def time_s(self) -> float:
-        """Simulated time [s]."""
-        ...
-
-    def visuals(self) -> Sequence[Visual]:
-        """Everything that can be seen; the same object until something is added or removed."""
-        ...
-
-    def visual_poses(self) -> Array:
-        """Poses of the visuals in base (K, 4, 4)."""
-        ...
-
-    def step(self, n: int) -> None:
-        """Advance by n steps of 1/240 s."""
-        ...
-
-    def attach(self, device: object) -> None:
-        """Count a device that uses the world."""
-        ...
-
-    def detach(self, device: object) -> None:
-        """Let a device go."""
-        ...
 
 
 class TwinCamera:
@@ -109,15 +71,21 @@ class TwinCamera:
         """Start the stream and wait until its exposure has settled.
 
         Raises:
-            ConfigError: open3d is not installed.
+            ConfigError: open3d is not installed, or the world cannot be built.
         """
         if self._first_frame is not None:
             return
-        self._prepare()
+        load_open3d()
         self._world.attach(self)
-        self._first_frame = self._frame_number()
-        if self._noise.warm_up:
-            self._world.step(WARM_UP_FRAMES * _STEPS_PER_FRAME)
+        try:
+            self._prepare()
+            self._first_frame = self._frame_number()
+            if self._noise.warm_up:
+                self._world.step(WARM_UP_FRAMES * _STEPS_PER_FRAME)
+        except BaseException:
+            self._first_frame = None
+            self._world.detach(self)
+            raise
 
     def close(self) -> None:
         """Stop the stream."""
@@ -183,7 +151,7 @@ class TwinCamera:
         return self._first_frame
 
     def _frame_number(self) -> int:
-        return round(self._world.time_s * STEPS_PER_S) // _STEPS_PER_FRAME
+        return round(self._world.time_s / STEP_S) // _STEPS_PER_FRAME
 
     def _prepare(self) -> RayCaster:
         visuals = self._world.visuals()

@@ -7,7 +7,7 @@ import functools
 import importlib
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,25 +19,12 @@ if TYPE_CHECKING:
 
     from robotcell.geometry import Array
     from robotcell.interfaces import Intrinsics
+    from sim_twin.world import Visual
 
 Floats = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int32]
 
 _LIBUSB = "libusb-1.0.so.0"
-
-
-class Mesh(Protocol):
-    """A rigid mesh of triangles, which may wind either way."""
-
-    @property
-    def vertices(self) -> Floats:
-        """(N, 3) [m] in the frame of its link."""
-        ...
-
-    @property
-    def triangles(self) -> Indices:
-        """(M, 3) indices of vertices."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -47,7 +34,7 @@ class Hits:
     Attributes:
         depth_m: (H, W) float32 [m] along the optical axis, 0 = nothing.
         triangle: (H, W) int32, index into the two tables below, -1 = nothing (which is their last row).
-        visual_of: (T + 1,) int32, the mesh that each triangle belongs to; -1 in the last row.
+        visual_of: (T + 1,) int32, the visual that each triangle belongs to; -1 in the last row.
         normal_of: (T + 1, 3) float32, unit normals in base on the side of the camera; 0 in the last row.
         range_of: (T + 1,) float32, distance [m] from camera to plane of each triangle; 0 in the last row.
     """
@@ -59,7 +46,7 @@ class Hits:
     range_of: Floats
 
     def visual(self) -> Indices:
-        """(H, W) index of the mesh that each pixel sees, -1 for none."""
+        """(H, W) index of the visual that each pixel sees, -1 for none."""
         return self.visual_of[self.triangle]
 
     def normals(self) -> Floats:
@@ -74,24 +61,26 @@ class RayCaster:
     one geometry: 1 to 3 ms for the few thousand triangles of the cell.
 
     Args:
-        meshes: what there is to see.
+        visuals: what there is to see; their triangles may wind either way.
         intrinsics: pinhole model; the rays pass through the pixels' integer coordinates.
         T_base_camera: pose of the colour optical frame (4, 4).
         threads: that Embree may use.
     """
 
-    def __init__(self, meshes: Sequence[Mesh], intrinsics: Intrinsics, T_base_camera: Array, threads: int = 2) -> None:
+    def __init__(
+        self, visuals: Sequence[Visual], intrinsics: Intrinsics, T_base_camera: Array, threads: int = 2
+    ) -> None:
         self._open3d = load_open3d()
         self._threads = threads
-        counts = [len(mesh.vertices) for mesh in meshes]
-        starts = np.cumsum([0, *counts])
-        self._vertices = np.concatenate([mesh.vertices for mesh in meshes], dtype=np.float32)
-        self._mesh_of_vertex = np.repeat(np.arange(len(meshes)), counts)
+        counts = [len(visual.vertices) for visual in visuals]
+        starts = np.cumsum([0, *counts[:-1]])
+        self._vertices = np.concatenate([visual.vertices for visual in visuals], dtype=np.float32)
+        self._visual_of_vertex = np.repeat(np.arange(len(visuals)), counts)
         self._triangles = np.concatenate(
-            [mesh.triangles + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+            [visual.triangles + start for visual, start in zip(visuals, starts, strict=True)]
         ).astype(np.uint32)
-        mesh_of_triangle = np.repeat(np.arange(len(meshes)), [len(mesh.triangles) for mesh in meshes])
-        self._visual_of = np.append(mesh_of_triangle, -1).astype(np.int32)
+        visual_of = np.repeat(np.arange(len(visuals)), [len(visual.triangles) for visual in visuals])
+        self._visual_of = np.append(visual_of, -1).astype(np.int32)
         self._center = T_base_camera[:3, 3].astype(np.float32)
         self._rays = self._open3d.core.Tensor(_rays(intrinsics, T_base_camera))
 
@@ -99,7 +88,7 @@ class RayCaster:
         """One frame.
 
         Args:
-            poses: (K, 4, 4) poses of the meshes in base.
+            poses: (K, 4, 4) poses of the visuals in base.
         """
         vertices = self._in_base(poses)
         core = self._open3d.core
@@ -124,7 +113,7 @@ class RayCaster:
         )
 
     def _in_base(self, poses: Array) -> Floats:
-        T = poses.astype(np.float32)[self._mesh_of_vertex]
+        T = poses.astype(np.float32)[self._visual_of_vertex]
         rotated = np.einsum("nij,nj->ni", T[:, :3, :3], self._vertices)
         return np.ascontiguousarray(rotated + T[:, :3, 3], dtype=np.float32)
 

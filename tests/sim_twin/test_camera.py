@@ -1,12 +1,15 @@
+import cv2
 import numpy as np
 import pytest
 
-from robotcell.config import CameraMount
-from robotcell.errors import ConnectionLost
+from robotcell.config import CameraMount, load_config
+from robotcell.errors import ConfigError, ConnectionLost
 from robotcell.geometry import look_at, transform_points
+from sim_twin.backend import TwinOptions
 from sim_twin.camera import TwinCamera
 from sim_twin.noise import WARM_UP_FRAMES, NoiseOptions
 from sim_twin.raycast import ray_directions
+from sim_twin.world import World
 from tests.sim_twin.boxes import Box, BoxWorld, box_at, table_with_blocks
 
 CLEAN = NoiseOptions(**dict.fromkeys(NoiseOptions.model_fields, False))
@@ -121,5 +124,40 @@ def test_a_camera_that_is_not_connected_says_so():
         assert world.devices == [camera]
     camera.close()
     assert world.devices == []
+    with pytest.raises(ConnectionLost):
+        camera.read()
+
+
+@pytest.mark.parametrize("resolution", ["640x480", "1280x720"])
+def test_in_the_twin_things_are_seen_where_the_world_has_them(resolution):
+    config = load_config(overrides={"camera.resolution": resolution, "backend.options.seed": 4})
+    world = World(config, TwinOptions(seed=4))
+    with TwinCamera(world, config.camera, NoiseOptions(), 4) as camera:
+        frame = camera.read()
+        _, visual = camera.render_truth()
+        seen, objects = world.visuals(), world.objects()
+    rays = ray_directions(frame.intrinsics)
+    points = transform_points(config.camera.pose(), rays * frame.depth_m[..., None])
+    measured = frame.depth_m > 0
+    table = np.isin(visual, [k for k, v in enumerate(seen) if v.kind == "table"])
+    edge = cv2.dilate(table.astype(np.uint8), np.ones((9, 9))) != cv2.erode(table.astype(np.uint8), np.ones((9, 9)))
+    x, y = points[..., 0], points[..., 1]
+    workspace = (x > -0.724) & (x < -0.276) & (abs(y) < 0.224)
+    heights = points[table & ~edge & measured & workspace][:, 2]
+    assert abs(heights.mean()) < 0.0005
+    assert heights.std() < 0.0025
+    assert measured[workspace & table & ~edge].mean() > 0.98
+    for index, (_, T_base_object) in enumerate(objects):
+        pixels = np.isin(visual, [k for k, v in enumerate(seen) if v.object_index == index]) & measured
+        if pixels.sum() > 100:
+            offset = np.median(points[pixels], axis=0) - T_base_object[:3, 3]
+            assert np.linalg.norm(offset) < 0.06
+
+
+def test_a_world_that_cannot_be_built_leaves_nothing_attached():
+    world = World(load_config(), TwinOptions(scene="no such scene"))
+    camera = TwinCamera(world, CameraMount(), CLEAN, 1)
+    with pytest.raises(ConfigError):
+        camera.connect()
     with pytest.raises(ConnectionLost):
         camera.read()

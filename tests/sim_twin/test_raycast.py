@@ -1,5 +1,6 @@
 import ctypes
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -41,6 +42,14 @@ def test_a_box_covers_its_projection_and_nothing_else():
     # The camera is nearly above the box, so its sides show as a rim of a few pixels at most.
     assert on_top.sum() <= (hits.visual() == 1).sum() < 2 * on_top.sum()
     assert set(np.unique(hits.visual())) == {0, 1}
+
+
+def test_normals_face_the_camera_however_triangles_wind():
+    box = Box((1, 1, 1))
+    inside_out = SimpleNamespace(vertices=box.vertices, triangles=box.triangles[:, ::-1])
+    for mesh in (box, inside_out):
+        hits = RayCaster([mesh], SMALL, look_at((0, 0, 1), (0, 0, 0))).cast(np.array([box_at(0, 0, 0)]))
+        np.testing.assert_allclose(hits.normals()[24, 31], (0, 0, 1), atol=1e-6)
 
 
 def test_what_meets_nothing_is_zero_depth_and_no_visual():
