@@ -65,7 +65,8 @@ class TwinCamera:
         self._first_frame: int | None = None
         self._caster: RayCaster | None = None
         self._cast_visuals: Sequence[Visual] = ()
-        self._pixel_range = np.linalg.norm(ray_directions(self._intrinsics), axis=2).astype(np.float32)
+        # Metres along each pixel's ray for a metre of depth; filled when the stream starts.
+        self._pixel_range = np.empty((0, 0), dtype=np.float32)
 
     def connect(self) -> None:
         """Start the stream and wait until its exposure has settled.
@@ -79,6 +80,7 @@ class TwinCamera:
         self._world.attach(self)
         try:
             self._prepare()
+            self._pixel_range = np.linalg.norm(ray_directions(self._intrinsics), axis=2).astype(np.float32)
             self._first_frame = self._frame_number()
             if self._noise.warm_up:
                 self._world.step(WARM_UP_FRAMES * _STEPS_PER_FRAME)
