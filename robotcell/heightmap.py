@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 # lower one leaves room for the largest table offset that a configuration may allow (5 cm).
 BAND_M = (-0.10, 0.30)
 
-# `Heightmap.filled` closes holes from their rims by this many cells: 6 mm at 2 mm resolution, the gaps that
-# drop-out and an oblique view leave, and less than the shadow of the lowest block (25 mm high, 15 mm shadow).
-_FILL_CELLS = 3
+# An unknown cell with this many known neighbours of eight lies in a gap between pixels, not in a shadow, whose
+# straight edge has three.
+_GAP_NEIGHBOURS = 5
+# Gaps close from their rims this many times over: up to 6 cells, 12 mm at 2 mm resolution.
+_GAP_ROUNDS = 3
 
 # The table is sought among about this many returns, regularly spaced: enough for a tenth of a millimetre.
 _TABLE_SAMPLES = 20_000
@@ -82,26 +84,32 @@ class Heightmap:
     def filled(self) -> npt.NDArray[np.float32]:
         """The heights (H, W) [m] without NaN, for what cannot work with unknown cells.
 
-        A hole takes the highest of its neighbours, 3x3, from its rim inwards by three cells: small holes
-        close at the height of what surrounds them and objects do not shrink. What is still unknown (the
-        shadow behind an object, the world beyond the image) takes the table's level 0, the only value that
-        does not invent an object. Whoever plans a motion must therefore ask `height_m` whether a cell was
-        seen at all.
+        Gaps between pixels take the highest of their neighbours (`close_gaps`), so that they close at the height
+        of what surrounds them. What is still unknown (the shadow behind an object, the world beyond the image)
+        takes the table's level 0, the only value that does not invent an object. Whoever plans a motion must
+        therefore ask `height_m` whether a cell was seen at all.
         """
-        heights = grow_into_unknown(self.height_m, _FILL_CELLS)
-        return np.nan_to_num(heights, copy=False, nan=0.0)
+        return np.nan_to_num(close_gaps(self.height_m), copy=False, nan=0.0)
 
 
-def grow_into_unknown(height_m: npt.NDArray[np.float32], cells: int) -> npt.NDArray[np.float32]:
-    """A copy of (H, W) heights whose NaN take the highest of their 3x3 neighbours, `cells` times over."""
+def close_gaps(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """A copy of (H, W) heights without the gaps that drop-out and an oblique view leave between pixels.
+
+    A NaN with at least five known neighbours of eight takes the highest of them; three times over. The straight
+    edge of a shadow has three and stays where it is: what is large and unknown remains NaN.
+    """
     unknown = np.isnan(height_m)
-    lowest = np.float32(-np.inf)
-    heights = np.where(unknown, lowest, height_m)
+    heights = np.where(unknown, np.float32(-1), height_m)
     kernel = np.ones((3, 3), np.uint8)
-    for _ in range(cells):
-        grown = cv2.dilate(heights, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=float(lowest))
-        heights = np.where(np.isneginf(heights), grown, heights)
-    heights[np.isneginf(heights)] = np.nan
+    for _ in range(_GAP_ROUNDS):
+        known = (~unknown).astype(np.uint8)
+        count = cv2.boxFilter(known, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        gaps = unknown & (count >= _GAP_NEIGHBOURS)
+        if not gaps.any():
+            break
+        heights[gaps] = cv2.dilate(heights, kernel)[gaps]
+        unknown &= ~gaps
+    heights[unknown] = np.nan
     return heights
 
 
@@ -131,9 +139,7 @@ def build_heightmap(
     images: dict[str, npt.NDArray[Any]] = {"color": frame.color, "depth_m": frame.depth_m, **masks}
     for name, image in images.items():
         if image.shape[:2] != size:
-            raise ValueError(
-                f"image {name!r} is {image.shape[:2]}; the intrinsics say {size} (height, width)"
-            )
+            raise ValueError(f"image {name!r} is {image.shape[:2]}; the intrinsics say {size} (height, width)")
     pose = check_transform(T_base_camera, "T_base_camera")
     view = _view(frame.intrinsics, pose.tobytes(), workspace, table_height_m)
     rows, cols = workspace.shape
@@ -192,9 +198,7 @@ def _view(intrinsics: Intrinsics, pose: bytes, workspace: Workspace, table_heigh
     T_base_camera = np.frombuffer(pose).reshape(4, 4)
     crop = _crop(intrinsics, T_base_camera, workspace, table_height_m)
     v, u = np.mgrid[crop].astype(np.float64)
-    directions = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones_like(u)]
-    )
+    directions = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones_like(u)])
     scale = np.array([1 / workspace.resolution_m, 1 / workspace.resolution_m, 1.0])
     rays = np.einsum("ij,jvu->ivu", scale[:, None] * T_base_camera[:3, :3], directions)
     origin = scale * (T_base_camera[:3, 3] - (workspace.x[0], workspace.y[0], table_height_m))

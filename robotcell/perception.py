@@ -206,7 +206,7 @@ def _spread(labels: npt.NDArray[np.int32], region: npt.NDArray[np.bool_]) -> npt
     )
     label_at = np.zeros(int(nearest.max()) + 1, np.int32)
     label_at[nearest[labels > 0]] = labels[labels > 0]
-    return np.asarray(np.where(region, label_at[nearest], 0), np.int32)
+    return np.where(region, label_at[nearest], np.int32(0))
 
 
 def _depths(labels: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
@@ -221,7 +221,8 @@ def _split_necks(labels: npt.NDArray[np.int32], resolution_m: float) -> npt.NDAr
     """Split components whose parts hang together by a neck."""
     smallest, narrowest = _SMALLEST_M2 / resolution_m**2, _NARROWEST_M / resolution_m
     depths = _depths(labels)
-    result, following = labels.copy(), int(labels.max()) + 1
+    result: npt.NDArray[np.int32] = labels.copy()
+    following = int(labels.max()) + 1
     for label in range(1, int(labels.max()) + 1):
         whole = labels == label
         if np.count_nonzero(whole) < 2 * smallest:

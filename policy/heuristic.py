@@ -1,0 +1,143 @@
+"""The geometric policy: antipodal grasps read off the heightmap, and a push where none is clear."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from policy.grasping import DIRECTIONS, Grasps, Jaw, find_grasps, lay_table
+from policy.pushing import Pushes, find_pushes
+from policy.surface import Surface, cell_centers, estimate_surface
+from robotcell.decision import ROTATIONS, Action, Primitive
+from robotcell.errors import NoTarget
+from robotcell.perception import segment
+
+if TYPE_CHECKING:
+    from robotcell.config import CellConfig
+    from robotcell.decision import Observation
+    from robotcell.geometry import Array
+
+# A grasp that scores less is worth a push first, where one is allowed.
+CLEAR_GRASP = 0.30
+# A push must promise at least this much (the paper's tau, a gain of a tenth of the goal's border).
+USEFUL_PUSH = 0.10
+# An action this near to one that failed, and turned by at most one step, is the same action again.
+_SAME_M = 0.020
+
+
+class HeuristicPolicy:
+    """Takes the best clear grasp; else, if it may, the best push; else the best grasp that there is.
+
+    Args:
+        config: of the cell: gripper, camera position, table, workspace and length of a push.
+    """
+
+    name = "heuristic"
+
+    def __init__(self, config: CellConfig) -> None:
+        self._camera = config.camera.pose()[:3, 3]
+        self._table_height_m = config.table.height_m
+        self._push_m = config.motion.push_m
+        self._jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+
+    def decide(self, observation: Observation) -> Action:
+        """The best action.
+
+        Raises:
+            NoTarget: no object is seen, or nothing can be done about those that are.
+        """
+        targets = observation.objects if observation.goal is None else observation.goal
+        if not targets.any():
+            what = "no object" if observation.goal is None else "no cell of the goal"
+            raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
+        heightmap = observation.heightmap
+        surface = estimate_surface(heightmap, self._camera, self._table_height_m)
+        labels = _owners(observation)
+        table = lay_table(surface, labels, heightmap.workspace.resolution_m, self._jaw.opening_m)
+        grasp = self._best_grasp(find_grasps(table, targets, self._jaw), observation)
+        if grasp is not None and grasp.q_value >= CLEAR_GRASP:
+            return grasp
+        if observation.may_push:
+            push = self._best_push(surface, labels, observation)
+            if push is not None:
+                return push
+        if grasp is None:
+            raise NoTarget(
+                "no grasp fits and no push would help; rearrange the objects by hand, or choose another goal"
+            )
+        return grasp
+
+    def _best_grasp(self, grasps: Grasps, observation: Observation) -> Action | None:
+        score = grasps.score.copy()
+        x, y = cell_centers(observation.heightmap.workspace, grasps.row, grasps.col)
+        for barred in observation.barred:
+            if barred.primitive is Primitive.GRASP:
+                score[_same(x, y, grasps.rotation, barred, DIRECTIONS)] = 0
+        if not score.any():
+            return None
+        best = int(score.argmax())
+        return self._action(
+            Primitive.GRASP,
+            observation,
+            (int(grasps.row[best]), int(grasps.col[best]), int(grasps.rotation[best])),
+            float(grasps.surface_m[best]),
+            float(score[best]),
+        )
+
+    def _best_push(self, surface: Surface, labels: npt.NDArray[np.int32], observation: Observation) -> Action | None:
+        goal = None if observation.goal is None else 1
+        pushes = find_pushes(surface, labels, goal, observation.heightmap.workspace, self._push_m)
+        return self._choose_push(pushes, observation)
+
+    def _choose_push(self, pushes: Pushes, observation: Observation) -> Action | None:
+        score = pushes.score.copy()
+        x, y = cell_centers(observation.heightmap.workspace, pushes.row, pushes.col)
+        for barred in observation.barred:
+            if barred.primitive is Primitive.PUSH:
+                score[_same(x, y, pushes.rotation, barred, ROTATIONS)] = 0
+        if not len(score) or score.max() < USEFUL_PUSH:
+            return None
+        best = int(score.argmax())
+        return self._action(
+            Primitive.PUSH,
+            observation,
+            (int(pushes.row[best]), int(pushes.col[best]), int(pushes.rotation[best])),
+            float(pushes.surface_m[best]),
+            float(score[best]),
+        )
+
+    def _action(
+        self,
+        primitive: Primitive,
+        observation: Observation,
+        where: tuple[int, int, int],
+        surface_m: float,
+        score: float,
+    ) -> Action:
+        row, col, rotation = where
+        x, y = observation.heightmap.workspace.position(row, col)
+        return Action(primitive, row, col, rotation, (x, y, self._table_height_m + surface_m), score)
+
+
+def _owners(observation: Observation) -> npt.NDArray[np.int32]:
+    """(H, W) labels of the objects; a goal is label 1."""
+    labels = segment(observation.heightmap).labels
+    if observation.goal is None:
+        return np.where(observation.objects, labels, 0).astype(np.int32)
+    others = np.where(observation.objects & ~observation.goal & (labels > 0), labels + 1, 0)
+    return np.where(observation.goal, 1, others).astype(np.int32)
+
+
+def _same(
+    x: Array,
+    y: Array,
+    rotation: npt.NDArray[np.intp],
+    barred: Action,
+    period: int,
+) -> npt.NDArray[np.bool_]:
+    """Which actions would repeat one that failed."""
+    near = np.hypot(x - barred.xyz[0], y - barred.xyz[1]) < _SAME_M
+    turn = np.abs(rotation - barred.rotation) % period
+    return np.asarray(near & (np.minimum(turn, period - turn) <= 1), np.bool_)
