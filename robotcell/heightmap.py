@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import cv2
@@ -118,7 +117,7 @@ def build_heightmap(
     T_base_camera: Array,
     workspace: Workspace,
     table_height_m: float,
-    masks: Mapping[str, npt.NDArray[np.bool_]] = MappingProxyType({}),
+    masks: Mapping[str, npt.NDArray[np.bool_]] | None = None,
 ) -> Heightmap:
     """Project a frame along gravity: each cell takes the height, colour and masks of its highest return.
 
@@ -136,6 +135,7 @@ def build_heightmap(
         ValueError: the transform is not rigid, or an image does not have the size that the intrinsics say.
     """
     size = (frame.intrinsics.height, frame.intrinsics.width)
+    masks = masks or {}
     images: dict[str, npt.NDArray[Any]] = {"color": frame.color, "depth_m": frame.depth_m, **masks}
     for name, image in images.items():
         if image.shape[:2] != size:
@@ -180,7 +180,7 @@ def build_heightmap(
         height_m=heights.reshape(rows, cols),
         table=_fit_table(col, row, height, workspace, len(seen)),
         coverage=len(seen) / (rows * cols),
-        masks=MappingProxyType({name: carried(image) for name, image in masks.items()}),
+        masks={name: carried(image) for name, image in masks.items()},
         t=frame.t,
     )
 

@@ -100,19 +100,14 @@ def object_mask(heightmap: Heightmap, min_height_m: float = MIN_OBJECT_M) -> npt
 def segment(heightmap: Heightmap) -> Segmentation:
     """Separate the objects: touching ones by colour, equal colours by steps in height and by narrow necks."""
     objects = object_mask(heightmap)
+    if not objects.any():
+        return Segmentation(np.zeros(objects.shape, np.int32), ())
     resolution = heightmap.workspace.resolution_m
     colors = _colors(heightmap, objects)
     labels = _components(colors, objects, _height_steps(heightmap.filled()))
     labels = _split_necks(labels, resolution)
     labels = _merge_fragments(labels, resolution)
     return _describe(labels, heightmap)
-
-
-def nearest_color(colors: npt.NDArray[np.uint8]) -> list[str]:
-    """The palette's name of each of (N, 3) RGB colours, by perceptual distance."""
-    features, _ = _features(colors)
-    names = list(PALETTE)
-    return [names[i] for i in _distances(features).argmin(axis=1)]
 
 
 def check_goal_word(word: str) -> str:
@@ -142,20 +137,17 @@ def find_goal(segmentation: Segmentation, color: str) -> Instance:
     raise NoTarget(f"no {color} object is seen on the table; there is: {listing or 'nothing'}")
 
 
-def _features(
-    colors: npt.NDArray[np.uint8],
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """(N, 3) perceptual coordinates of (N, 3) RGB colours, and their (N,) lightness."""
+def _features(colors: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """(N, 3) perceptual coordinates of (N, 3) RGB colours, N > 0."""
     lab = cv2.cvtColor(colors[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
     lightness = lab[:, 0]
     at_equal_light = lab[:, 1:] * ((_LIGHTNESS + 16) / (lightness[:, None] + 16))
-    return np.column_stack([at_equal_light, _LIGHTNESS_WEIGHT * lightness]), lightness
+    return np.column_stack([at_equal_light, _LIGHTNESS_WEIGHT * lightness])
 
 
 @lru_cache(maxsize=1)
 def _palette_features() -> npt.NDArray[np.float32]:
-    features, _ = _features(np.array(list(PALETTE.values()), np.uint8))
-    return features
+    return _features(np.array(list(PALETTE.values()), np.uint8))
 
 
 def _distances(features: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -167,7 +159,7 @@ def _distances(features: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 def _colors(heightmap: Heightmap, objects: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
     """(H, W) index of the palette colour that fits each object cell and its surroundings best."""
     known = objects & np.isfinite(heightmap.height_m)
-    features, _ = _features(heightmap.color[known])
+    features = _features(heightmap.color[known])
     planes = np.zeros((*objects.shape, len(PALETTE)), np.float32)
     # Negative: cells without an object weigh nothing, and the largest sum wins.
     planes[known] = np.minimum(_distances(features), _FAR) - _FAR
@@ -301,7 +293,7 @@ def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentati
 
 def _name(colors: npt.NDArray[np.uint8]) -> str:
     """The palette colour of an instance's (N, 3) cells: of their median, which noise and rims do not move."""
-    features, _ = _features(colors)
+    features = _features(colors)
     return list(PALETTE)[int(_distances(np.median(features, axis=0)[None]).argmin())]
 
 
