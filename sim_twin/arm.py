@@ -33,13 +33,15 @@ if TYPE_CHECKING:
 
     from sim_twin.world import World
 
-# Universal Robots, URScript manual: stopj brakes at the deceleration that it is given; ur_rtde's stop passes 10.
-STOP_DECELERATION_RAD_S2 = 10.0
+# A stop brakes the tool at 10 m/s^2 (what ur_rtde passes to stopl), here 0.5 m from the joint that turns fastest.
+STOP_DECELERATION_RAD_S2 = 20.0
 # Universal Robots, factory safety preset of the UR5e: force limit.
 PROTECTIVE_FORCE_N = 150.0
 # A joint this far from where it should be could not follow: its motor is at its limit. Assumed.
 TRACKING_ERROR_RAD = 0.05
 WATCHDOG_S = 0.1
+# A motion that starts pressed against something may press this much more. Assumed.
+_LEAVING_FORCE_N = 30.0
 
 # Share of the position error that the joint controllers correct within a step.
 _POSITION_GAIN = 0.5
@@ -64,7 +66,7 @@ class TwinArm:
         self._path = np.empty((0, 6))
         self._index = 0
         self._braking = False
-        self._force_at_start = np.zeros(3)
+        self._force_limit_n = PROTECTIVE_FORCE_N
         self._kicked_at: float | None = None
 
     def __enter__(self) -> Self:
@@ -206,7 +208,9 @@ class TwinArm:
         self._path = np.vstack([self._path[-1], path])
         self._index = 0
         self._braking = False
-        self._force_at_start = self._world.contact().robot_force
+        # More than at the start, so that the arm can leave a contact that stopped it.
+        at_start = _norm(self._world.contact().robot_force)
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + _LEAVING_FORCE_N)
         if self._kicked_at is not None:
             self._kicked_at = self._world.time_s
 
@@ -226,9 +230,7 @@ class TwinArm:
         self._command(self._path[self._index])
 
     def _must_protect(self) -> bool:
-        # Measured from the force at the start, so that the arm can leave a contact that stopped it.
-        force = self._world.contact().robot_force - self._force_at_start
-        if math.sqrt(float(force @ force)) > PROTECTIVE_FORCE_N:
+        if _norm(self._world.contact().robot_force) > self._force_limit_n:
             return True
         q, _ = self._world.joint_states(self._joints)
         return float(np.abs(q - self._path[self._index]).max()) > TRACKING_ERROR_RAD
@@ -256,6 +258,10 @@ class TwinArm:
 
 
 _GAINS = (_POSITION_GAIN,) * 6
+
+
+def _norm(vector: Array) -> float:
+    return math.sqrt(float(vector @ vector))
 
 
 def _check_range(what: str, value: float, high: float, unit: str) -> None:

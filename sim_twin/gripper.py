@@ -25,9 +25,10 @@ WIDTH_SPEED_M_S = 0.11
 _REACHED_M = 0.0002
 # Stopped short of the commanded width by more than this, the fingers hold something.
 GRIP_TOLERANCE_M = 0.001
-# Slower than this for that many steps, the fingers were stopped.
+# Slower than this for that many steps, the fingers were stopped; they move on when they leave the place by more.
 _STILL_M_S = 0.004
 _STILL_STEPS = 12
+_GIVEN_WAY_M = 0.003
 # The worm drive cannot be pushed back: at rest the cranks hold with this torque.
 _HOLDING_TORQUE_NM = 20.0
 # Share of the remaining way that the fingers may cover within a step, so that they do not overshoot.
@@ -45,6 +46,8 @@ class TwinGripper:
         self._force_n = 0.0
         self._driving = False
         self._still_steps = 0
+        self._stopped_at_m = None
+        self._stopped_at_m: float | None = None
 
     def __enter__(self) -> Self:
         self.connect()
@@ -77,7 +80,7 @@ class TwinGripper:
         """The state after the last step."""
         self._need_connection()
         width = _width(self._world.joint_states(self._cranks)[0])
-        stopped = self._still_steps >= _STILL_STEPS
+        stopped = self._stopped_at_m is not None
         return GripperState(
             t=self._world.time_s,
             width_m=width,
@@ -98,6 +101,7 @@ class TwinGripper:
             self._target_m, self._force_n = width_m, force_n
             self._driving = True
             self._still_steps = 0
+            self._stopped_at_m = None
 
     def stop(self) -> None:
         """Hold the fingers where they are."""
@@ -123,10 +127,15 @@ class TwinGripper:
         self._world.drive_speeds(self._cranks, (speed / (2 * lever),) * 2, (self._force_n * lever,) * 2)
         still = abs(float(rates.sum())) * lever < _STILL_M_S
         self._still_steps = self._still_steps + 1 if still else 0
+        if self._stopped_at_m is None and self._still_steps >= _STILL_STEPS:
+            self._stopped_at_m = width
+        elif self._stopped_at_m is not None and abs(width - self._stopped_at_m) > _GIVEN_WAY_M:
+            self._still_steps, self._stopped_at_m = 0, None
 
     def _hold(self) -> None:
         self._driving = False
         self._still_steps = 0
+        self._stopped_at_m = None
         angle = linkage.crank_angle(self._target_m)
         self._world.drive_positions(self._cranks, (angle,) * 2, (_HOLDING_TORQUE_NM,) * 2, (0.5,) * 2)
 

@@ -41,8 +41,12 @@ _ROLLING_FRICTION = 0.001
 _SPINNING_FRICTION = 0.002
 # Rubber finger tips and the compliance of the arm behind them: a contact force grows over millimetres, as on the
 # real cell, not within one step.
-_TIP_STIFFNESS_N_M = 20000.0
-_TIP_DAMPING_N_S_M = 200.0
+_TIP_STIFFNESS_N_M = 10000.0
+_TIP_DAMPING_N_S_M = 20.0
+# Moments of inertia of crank and finger: the motor's own, seen through the worm drive (assumed). The solver needs
+# them of this size: with those of the bare links the gears give way to a grip of 40 N.
+_CRANK_INERTIA_KG_M2 = 0.003
+_FINGER_INERTIA_KG_M2 = 0.001
 # The engine keeps this distance between convex shapes; they are made smaller by it.
 _COLLISION_MARGIN_M = 0.001
 _GEAR_ERP = 0.5
@@ -336,8 +340,12 @@ class World:
                 joints[finger],
                 contactStiffness=_TIP_STIFFNESS_N_M,
                 contactDamping=_TIP_DAMPING_N_S_M,
+                localInertiaDiagonal=[_FINGER_INERTIA_KG_M2] * 3,
                 physicsClientId=client,
             )
+        for crank in (robot_model.LEFT_CRANK, robot_model.RIGHT_CRANK):
+            inertia = [_CRANK_INERTIA_KG_M2] * 3
+            p.changeDynamics(robot, joints[crank], localInertiaDiagonal=inertia, physicsClientId=client)
         # The shoulder turns where the foot goes through a table that is higher than the arm's base.
         p.setCollisionFilterPair(table, robot, -1, joints[robot_model.ARM_JOINTS[0]], 0, physicsClientId=client)
         angle = linkage.crank_angle(self.config.gripper.preshape_m)
