@@ -5,11 +5,10 @@ from __future__ import annotations
 from math import isnan
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cli.errors import report_error
+from cli.console import report_error, results
 from robotcell.config import load_config
 from robotcell.errors import CellError
 from robotcell.journal import Job, Journal, Metrics
@@ -24,8 +23,8 @@ def list_jobs(cell_file: Path | None, limit: int) -> int:
         with Journal(load_config(cell_file).journal.database_url()) as journal:
             rows = [(job, journal.metrics(job.id)) for job in journal.jobs(limit)]
     except CellError as error:
-        return report_error(error, Console(stderr=True, highlight=False))
-    out = Console(highlight=False)
+        return report_error(error)
+    out = results()
     if not rows:
         out.print("no jobs yet")
         return 0
@@ -52,8 +51,8 @@ def show_job(cell_file: Path | None, job_id: int) -> int:
         with Journal(load_config(cell_file).journal.database_url()) as journal:
             job, metrics = journal.job(job_id), journal.metrics(job_id)
     except CellError as error:
-        return report_error(error, Console(stderr=True, highlight=False))
-    out = Console(highlight=False)
+        return report_error(error)
+    out = results()
     out.print(f"job {job.id}: pick {_goal(job)} with {job.policy}, {job.status}", style="bold")
     if job.reason:
         out.print(job.reason, soft_wrap=True)

@@ -8,11 +8,10 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cli.errors import NOT_COMPLETE, report_error
+from cli.console import NOT_COMPLETE, progress, report_error, results
 from policy import make_policy
 from robotcell.album import Album, describe, draw_decision, save_picture
 from robotcell.cell import open_cell
@@ -25,6 +24,7 @@ from robotcell.perception import check_goal_word
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from rich.console import Console
     from rich.status import Status
 
 
@@ -38,7 +38,7 @@ def run_pick(
     as_json: bool,
 ) -> int:
     """Run the command; returns the exit code. Progress and errors go to stderr, results to stdout."""
-    err = Console(stderr=True, highlight=False)
+    err = progress()
     started = time.perf_counter()
     try:
         goals = _goals(goal, everything)
@@ -49,12 +49,12 @@ def run_pick(
     except CellError as error:
         if as_json:
             _print_json({"completed": False, "error": str(error), "wall_s": round(time.perf_counter() - started, 3)})
-        return report_error(error, err)
+        return report_error(error)
     summary = _summary(report, time.perf_counter() - started)
     if as_json:
         _print_json(summary)
     else:
-        _print_summary(summary, Console(highlight=False))
+        _print_summary(summary, results())
     return 0 if report.completed else NOT_COMPLETE
 
 
@@ -103,7 +103,7 @@ def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, err: Console, *,
             }
         )
         return 0
-    out = Console(highlight=False)
+    out = results()
     out.print(f"{describe(decision)}; the plan is safe, nothing moved")
     out.print(f"steps: {', '.join(steps)}")
     out.print(f"picture: {path}", soft_wrap=True)

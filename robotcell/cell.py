@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from robotcell.config import CellConfig, find_backend
-from robotcell.errors import CellError, ConnectionLost, DeviceFault
+from robotcell.errors import ConnectionLost, DeviceFault
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -30,13 +30,14 @@ class Cell:
         Raises:
             ConnectionLost, DeviceFault: the failure of the one device that failed, or all of them together
                 (as DeviceFault if every device could be reached).
+            ConfigError: a backend finds its own settings wrong, at the first device.
         """
-        failures: list[tuple[str, CellError]] = []
+        failures: list[tuple[str, ConnectionLost | DeviceFault]] = []
         try:
             for name, device in (("arm", self.arm), ("gripper", self.gripper), ("camera", self.camera)):
                 try:
                     device.connect()
-                except CellError as error:
+                except (ConnectionLost, DeviceFault) as error:
                     failures.append((name, error))
         except BaseException:
             self.close()

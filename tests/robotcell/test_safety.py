@@ -111,7 +111,7 @@ def test_a_line_out_of_the_box_is_refused() -> None:
 
 def test_a_line_out_of_reach_is_refused() -> None:
     wide = CONFIG.model_copy(update={"limits": CONFIG.limits.model_copy(update={"x": (-3.0, 3.0)})})
-    with pytest.raises(UnsafeMotion, match="cannot reach|singularity"):
+    with pytest.raises(UnsafeMotion, match=r"cannot reach|singularity"):
         check_plan(plan_of(above(-0.6, 0.0, 0.3), to(-1.2, 0.0, 0.3)), wide)
 
 
@@ -158,7 +158,7 @@ def test_a_line_through_the_wrist_singularity_is_refused() -> None:
     config = CellConfig.model_validate({"limits": wide})
     T_goal = T.copy()
     T_goal[:3, :3] = T_past[:3, :3]
-    with pytest.raises(UnsafeMotion, match="singularity|cannot reach"):
+    with pytest.raises(UnsafeMotion, match=r"singularity|cannot reach"):
         check_plan(plan_of(joint_move(q), LinearMove("line", T_goal, 0.1, 1.0)), config)
 
 

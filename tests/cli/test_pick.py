@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+from PIL import Image
+from typer.testing import CliRunner, Result
+
+from cli.main import app
+
+SCENE = """
+name = "three blocks"
+drop = false
+
+[[object]]
+name = "goal"
+shape = "cube"
+color = "red"
+position = [0.0, 0.1, 0.025]
+
+[[object]]
+name = "second"
+shape = "plank"
+color = "blue"
+position = [-0.1, -0.1, 0.0125]
+
+[[object]]
+name = "third"
+shape = "cylinder"
+color = "yellow"
+position = [0.1, -0.05, 0.025]
+"""
+
+
+@pytest.fixture
+def cell(tmp_path: Path) -> Path:
+    """A cell file whose twin holds three blocks and whose runs go to the test's own folder."""
+    (tmp_path / "blocks.toml").write_text(SCENE)
+    path = tmp_path / "cell.toml"
+    path.write_text(
+        f'[journal]\nruns = "{tmp_path / "runs"}"\n[backend.options]\nscene = "{tmp_path / "blocks.toml"}"\n'
+    )
+    return path
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def run_json(*arguments: str | Path) -> dict[str, Any]:
+    """Run in a process of its own, so that whatever any library prints would spoil the JSON."""
+    completed = subprocess.run(
+        [sys.executable, "-W", "error", "-c", "from cli.main import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert completed.returncode in {0, 1}, completed.stderr
+    summary: dict[str, Any] = json.loads(completed.stdout)
+    return summary
+
+
+def test_a_goal_is_picked_from_the_command_line(cell: Path) -> None:
+    summary = run_json("pick", "--goal", "red", "--cell", cell, "--json")
+    assert summary["completed"] is True
+    assert summary["picked"] == 1
+    assert summary["actions"] == summary["pushes"] + summary["grasp_attempts"]
+    assert summary["simulated_s"] > 5
+    run_dir = Path(summary["run_dir"])
+    pages = sorted(run_dir.glob("step-*.png"))
+    assert len(pages) == summary["actions"]
+    assert cv2.imread(str(pages[0])).shape == (514, 1600, 3)
+    with Image.open(run_dir / "summary.gif") as animation:
+        assert animation.n_frames == summary["actions"] + 1  # type: ignore[attr-defined]
+
+
+def test_the_same_seed_gives_the_same_job_to_the_last_action(tmp_path: Path) -> None:
+    def once(folder: str) -> tuple[Any, ...]:
+        path = tmp_path / f"{folder}.toml"
+        path.write_text(f'[journal]\nruns = "{tmp_path / folder}"\n')
+        summary = run_json("pick", "--all", "--cell", path, "--objects", "2", "--seed", "5", "--json")
+        listing = run("jobs", "show", str(summary["job"]), "--cell", path).stdout
+        table = [line for line in listing.splitlines() if "pictures" not in line]
+        return summary["simulated_s"], summary["picked_objects"], table[: table.index(table[-1])]
+
+    assert once("first") == once("second")
+
+
+def test_a_dry_run_draws_and_moves_nothing(cell: Path, tmp_path: Path) -> None:
+    summary = run_json("pick", "--goal", "red", "--cell", cell, "--dry-run", "--json")
+    assert summary["primitive"] == "grasp"
+    assert "descend guarded" in summary["steps"]
+    assert Path(summary["picture"]).is_file()
+    assert not (tmp_path / "runs" / "journal.db").exists()
+
+
+def test_jobs_are_listed_and_shown(cell: Path) -> None:
+    assert "no jobs yet" in run("jobs", "--cell", cell).stdout
+    picked = run("pick", "--goal", "blue", "--cell", cell)
+    assert picked.exit_code == 0, picked.output
+    listing = run("jobs", "--cell", cell)
+    assert "complete" in listing.stdout
+    shown = run("jobs", "show", "1", "--cell", cell)
+    assert shown.exit_code == 0
+    assert "pick blue with heuristic, complete" in shown.stdout
+    missing = run("jobs", "show", "9", "--cell", cell)
+    assert missing.exit_code == 2
+    assert "no job 9" in missing.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("--goal", "mauve"), 2, "mauve"),
+        ((), 2, "say either --goal"),
+        (("--goal", "red", "--all"), 2, "say either --goal"),
+        (("--goal", "red", "--objects", "0"), 2, "backend.options.objects = 0"),
+        (("--goal", "red", "--policy", "oracle"), 2, "no policy is called 'oracle'"),
+        (("--goal", "red", "--scene", "moon"), 2, "moon"),
+        (("--goal", "green"), 1, "no green object"),
+    ],
+)
+def test_a_refusal_says_why(cell: Path, arguments: tuple[str, ...], code: int, message: str) -> None:
+    result = run("pick", "--cell", cell, *arguments)
+    assert result.exit_code == code, result.output
+    assert message in result.stderr
+
+
+def test_a_refusal_is_json_too(cell: Path) -> None:
+    result = run("pick", "--cell", cell, "--goal", "green", "--json")
+    assert result.exit_code == 1
+    summary = json.loads(result.stdout)
+    assert summary["completed"] is False
+    assert "no green object" in summary["error"]
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom typer.testing import CliRunner\nfrom cli.main import app\n"
+        "result = CliRunner().invoke(app, ['--help'])\nassert 'pick' in result.stdout\n"
+        "heavy = {'numpy', 'cv2', 'scipy', 'pydantic', 'sqlalchemy', 'pybullet', 'open3d'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stderr
