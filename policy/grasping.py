@@ -230,7 +230,7 @@ def _hold(
     lean = np.maximum(
         np.median(np.where(held, right - right_high, 0), axis=1), np.median(np.where(held, left - left_high, 0), axis=1)
     ) * (_STEP_M / rise)
-    upright = np.exp(-((lean / (1.5 * _FRICTION)) ** 2))
+    upright = np.exp(-((lean / (0.8 * _FRICTION)) ** 2))
     # Anything else in the way of the fingers.
     foreign = (material & (owners != own)).sum(axis=(1, 2)) / np.maximum(material.sum(axis=(1, 2)), 1)
     alone = np.clip(1 - foreign / 0.20, 0, 1)
