@@ -47,7 +47,7 @@ def scenes(draw):
     )
     table = draw(st.floats(-0.3, 0.3))
     aim = np.array([x + size[0] / 2, y + size[1] / 2, table])
-    eye = aim + [draw(st.floats(-0.6, 0.6)), draw(st.floats(-0.6, 0.6)), draw(st.floats(0.05, 1.0))]
+    eye = np.add(aim, (draw(st.floats(-0.6, 0.6)), draw(st.floats(-0.6, 0.6)), draw(st.floats(0.05, 1.0))))
     roll = make_transform(rotation_z(draw(st.floats(-np.pi, np.pi))), (0, 0, 0))
     T_base_camera = look_at(eye, aim) @ roll
     focal = draw(st.floats(20, 120))
