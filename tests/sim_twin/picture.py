@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from robotcell.cell import open_cell
 from robotcell.config import load_config
-from sim_twin.world import World
 
 if TYPE_CHECKING:
     import numpy.typing as npt
+
+    from sim_twin.world import World
 
 
 def draw(

@@ -1,0 +1,183 @@
+"""What every `Arm` does."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from robotcell import kinematics, linkage
+from robotcell.errors import ConnectionLost, UnsafeMotion
+from robotcell.geometry import make_transform, rotation_angle, rotation_z
+from robotcell.interfaces import ArmMode
+
+if TYPE_CHECKING:
+    from robotcell.cell import Cell
+    from robotcell.geometry import Array
+
+PERIOD_S = 0.008
+
+
+def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:
+    arm = closed_cell.arm
+    arm.close()
+    with arm as entered:
+        assert entered is arm
+        arm.connect()
+        assert arm.state().mode is ArmMode.READY
+    arm.close()
+    with pytest.raises(ConnectionLost):
+        arm.state()
+
+
+@pytest.mark.parametrize("call", ["state", "stop", "kick", "recover", "moving", "start_joints", "start_linear"])
+def test_refuses_everything_before_it_is_connected(closed_cell: Cell, call: str) -> None:
+    arm = closed_cell.arm
+    with pytest.raises(ConnectionLost):
+        if call == "moving":
+            _ = arm.moving
+        elif call == "start_joints":
+            arm.start_joints(np.zeros(6), 0.1, 0.1)
+        elif call == "start_linear":
+            arm.start_linear(np.eye(4), 0.1, 0.1)
+        else:
+            getattr(arm, call)()
+
+
+def test_state_is_one_consistent_measurement(cell: Cell) -> None:
+    state = cell.arm.state()
+    assert state.q.shape == state.qd.shape == state.wrench.shape == (6,)
+    assert np.isfinite(state.wrench).all()
+    assert state.t <= cell.clock.now()
+    tip = make_transform(np.eye(3), (0, 0, linkage.CLOSED_LENGTH_M))
+    # A real arm's own calibration differs from the nominal one by some millimetres.
+    assert np.abs(state.T_base_tcp - kinematics.forward(state.q) @ tip).max() < 0.01
+    np.testing.assert_allclose(state.q, cell.config.motion.home_q, atol=0.01)
+
+
+def test_joint_motion_returns_at_once_and_arrives(cell: Cell) -> None:
+    target = cell.arm.state().q + (0.2, -0.1, 0.1, 0.0, 0.1, -0.3)
+    begin = cell.clock.now()
+    cell.arm.start_joints(target, 1.0, 1.4)
+    assert cell.arm.moving
+    finish(cell)
+    # 0.3 rad with ramps of 1.4 rad/s^2 never reach 1 rad/s: 2 sqrt(0.3 / 1.4) s.
+    assert cell.clock.now() - begin == pytest.approx(2 * np.sqrt(0.3 / 1.4), abs=0.1)
+    np.testing.assert_allclose(cell.arm.state().q, target, atol=2e-3)
+    np.testing.assert_allclose(cell.arm.state().qd, 0, atol=0.02)
+
+
+def test_joint_motion_to_where_it_is_ends_at_once(cell: Cell) -> None:
+    q = cell.arm.state().q
+    cell.arm.start_joints(q, 1.0, 1.4)
+    finish(cell)
+    np.testing.assert_allclose(cell.arm.state().q, q, atol=1e-3)
+
+
+def test_linear_motion_keeps_to_the_line_and_its_speed(cell: Cell) -> None:
+    T_start = cell.arm.state().T_base_tcp
+    T_end = T_start.copy()
+    T_end[:3, 3] += (0.05, -0.04, 0.06)
+    T_end[:3, :3] = rotation_z(0.3) @ T_end[:3, :3]
+    along = T_end[:3, 3] - T_start[:3, 3]
+    length = np.linalg.norm(along)
+    cell.arm.start_linear(T_end, 0.1, 0.5)
+    positions = [T_start[:3, 3]]
+    while cell.arm.moving:
+        cell.arm.kick()
+        cell.clock.sleep(PERIOD_S)
+        positions.append(cell.arm.state().T_base_tcp[:3, 3])
+    steps = np.array(positions) - T_start[:3, 3]
+    assert np.linalg.norm(np.cross(steps, along / length), axis=1).max() < 0.001
+    assert np.linalg.norm(np.diff(steps, axis=0), axis=1).max() / PERIOD_S < 0.1 * 1.2
+    T_reached = cell.arm.state().T_base_tcp
+    assert np.abs(T_reached[:3, 3] - T_end[:3, 3]).max() < 0.001
+    assert rotation_angle(T_reached[:3, :3], T_end[:3, :3]) < 0.005
+
+
+def test_stop_ends_a_motion_short_of_its_target(cell: Cell) -> None:
+    start = cell.arm.state().q
+    cell.arm.start_joints(start + (0.5, 0, 0, 0, 0, 0), 0.5, 1.4)
+    run(cell, 0.5)
+    cell.arm.stop()
+    at_stop = cell.arm.state().q[0]
+    finish(cell)
+    run(cell, 0.2)
+    state = cell.arm.state()
+    assert state.mode is ArmMode.READY
+    assert start[0] + 0.05 < state.q[0] < start[0] + 0.4
+    # 0.5 rad/s is braked within less than a tenth of a second.
+    assert state.q[0] - at_stop < 0.05
+    np.testing.assert_allclose(state.qd, 0, atol=0.02)
+    cell.arm.stop()
+
+
+def test_a_second_motion_waits_for_the_first(cell: Cell) -> None:
+    q = cell.arm.state().q
+    cell.arm.start_joints(q + 0.05, 0.5, 1.0)
+    with pytest.raises(UnsafeMotion, match="moving"):
+        cell.arm.start_joints(q, 0.5, 1.0)
+    finish(cell)
+    np.testing.assert_allclose(cell.arm.state().q, q + 0.05, atol=2e-3)
+
+
+def test_the_watchdog_stops_an_arm_whose_supervisor_fell_silent(cell: Cell) -> None:
+    q = cell.arm.state().q
+    cell.arm.start_joints(q + (0.5, 0, 0, 0, 0, 0), 0.5, 1.4)
+    for _ in range(20):
+        cell.arm.kick()
+        cell.clock.sleep(PERIOD_S)
+    assert cell.arm.moving
+    cell.clock.sleep(0.5)
+    assert not cell.arm.moving
+    assert cell.arm.state().q[0] < q[0] + 0.3
+
+
+BAD_JOINTS = [np.zeros(5), np.full(6, np.nan), np.array([7.0, 0, 0, 0, 0, 0]), np.array([0, 0, 3.2, 0, 0, 0])]
+
+
+@pytest.mark.parametrize("q", BAD_JOINTS)
+def test_refuses_joint_targets_that_it_does_not_have(cell: Cell, q: Array) -> None:
+    with pytest.raises(UnsafeMotion):
+        cell.arm.start_joints(q, 0.5, 1.0)
+    assert not cell.arm.moving
+
+
+@pytest.mark.parametrize("value", [0.0, -0.1, 1000.0, np.nan, np.inf])
+def test_refuses_speeds_and_accelerations_outside_its_range(cell: Cell, value: float) -> None:
+    state = cell.arm.state()
+    for speed, acceleration in ((value, 0.5), (0.5, value)):
+        with pytest.raises(UnsafeMotion):
+            cell.arm.start_joints(state.q + 0.01, speed, acceleration)
+        with pytest.raises(UnsafeMotion):
+            cell.arm.start_linear(state.T_base_tcp, speed, acceleration)
+    assert not cell.arm.moving
+
+
+def test_refuses_poses_that_are_none_or_out_of_reach(cell: Cell) -> None:
+    T = cell.arm.state().T_base_tcp
+    far = T.copy()
+    far[:3, 3] = (-2.0, 0.0, 0.3)
+    mirrored = T @ np.diag([1.0, 1.0, -1.0, 1.0])
+    for pose in (far, mirrored, T[:3], np.full((4, 4), np.nan)):
+        with pytest.raises(UnsafeMotion):
+            cell.arm.start_linear(pose, 0.1, 0.5)
+    assert not cell.arm.moving
+
+
+def test_recover_does_nothing_to_an_arm_that_is_ready(cell: Cell) -> None:
+    cell.arm.recover()
+    assert cell.arm.state().mode is ArmMode.READY
+
+
+def run(cell: Cell, seconds: float) -> None:
+    for _ in range(round(seconds / PERIOD_S)):
+        cell.arm.kick()
+        cell.clock.sleep(PERIOD_S)
+
+
+def finish(cell: Cell) -> None:
+    while cell.arm.moving:
+        cell.arm.kick()
+        cell.clock.sleep(PERIOD_S)
