@@ -22,6 +22,8 @@ CONCAVITY_TOLERANCE = 0.02
 
 _MAX_PARTS = 24
 _CUTS_PER_AXIS = 9
+# Share of a surface that may be missing.
+_MAX_GAP = 0.005
 
 
 @dataclass(frozen=True)
@@ -215,10 +217,13 @@ def _signed_tetrahedra(mesh: Mesh) -> Array:
 
 
 def _is_closed(mesh: Mesh) -> bool:
-    # The tetrahedra of an open surface add up to any number. Public meshes have small cracks between faces
-    # whose edges differ, so edges are not counted.
+    # The area vectors of a closed surface add up to nothing. Edges are not counted: small cracks, where faces meet
+    # in edges that differ, do no harm.
+    corners = mesh.vertices[mesh.triangles]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    gap = np.linalg.norm(areas.sum(axis=0)) / max(np.linalg.norm(areas, axis=1).sum(), 1e-30)
     limit = _hull_volume(mesh.vertices)
-    return 0.01 * limit < abs(mesh_volume(mesh)) < 1.001 * limit
+    return bool(gap < _MAX_GAP and 0.01 * limit < abs(mesh_volume(mesh)) < 1.001 * limit)
 
 
 def _outward(mesh: Mesh) -> Mesh:
