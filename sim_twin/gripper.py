@@ -46,7 +46,7 @@ class TwinGripper:
         self._force_n = 0.0
         self._driving = False
         self._still_steps = 0
-        self._stopped_at_m = None
+        # The width at which something stopped the fingers.
         self._stopped_at_m: float | None = None
 
     def __enter__(self) -> Self:

@@ -34,15 +34,17 @@ def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:
 @pytest.mark.parametrize("call", ["state", "stop", "kick", "recover", "moving", "start_joints", "start_linear"])
 def test_refuses_everything_before_it_is_connected(closed_cell: Cell, call: str) -> None:
     arm = closed_cell.arm
+    calls = {
+        "state": arm.state,
+        "stop": arm.stop,
+        "kick": arm.kick,
+        "recover": arm.recover,
+        "moving": lambda: arm.moving,
+        "start_joints": lambda: arm.start_joints(np.zeros(6), 0.1, 0.1),
+        "start_linear": lambda: arm.start_linear(np.eye(4), 0.1, 0.1),
+    }
     with pytest.raises(ConnectionLost):
-        if call == "moving":
-            _ = arm.moving
-        elif call == "start_joints":
-            arm.start_joints(np.zeros(6), 0.1, 0.1)
-        elif call == "start_linear":
-            arm.start_linear(np.eye(4), 0.1, 0.1)
-        else:
-            getattr(arm, call)()
+        calls[call]()
 
 
 def test_state_is_one_consistent_measurement(cell: Cell) -> None:
@@ -57,7 +59,7 @@ def test_state_is_one_consistent_measurement(cell: Cell) -> None:
 
 
 def test_joint_motion_returns_at_once_and_arrives(cell: Cell) -> None:
-    target = cell.arm.state().q + (0.2, -0.1, 0.1, 0.0, 0.1, -0.3)
+    target = cell.arm.state().q + np.array((0.2, -0.1, 0.1, 0.0, 0.1, -0.3))
     begin = cell.clock.now()
     cell.arm.start_joints(target, 1.0, 1.4)
     assert cell.arm.moving
@@ -98,7 +100,7 @@ def test_linear_motion_keeps_to_the_line_and_its_speed(cell: Cell) -> None:
 
 def test_stop_ends_a_motion_short_of_its_target(cell: Cell) -> None:
     start = cell.arm.state().q
-    cell.arm.start_joints(start + (0.5, 0, 0, 0, 0, 0), 0.5, 1.4)
+    cell.arm.start_joints(start + np.array((0.5, 0, 0, 0, 0, 0)), 0.5, 1.4)
     run(cell, 0.5)
     cell.arm.stop()
     at_stop = cell.arm.state().q[0]
@@ -124,7 +126,7 @@ def test_a_second_motion_waits_for_the_first(cell: Cell) -> None:
 
 def test_the_watchdog_stops_an_arm_whose_supervisor_fell_silent(cell: Cell) -> None:
     q = cell.arm.state().q
-    cell.arm.start_joints(q + (0.5, 0, 0, 0, 0, 0), 0.5, 1.4)
+    cell.arm.start_joints(q + np.array((0.5, 0, 0, 0, 0, 0)), 0.5, 1.4)
     for _ in range(20):
         cell.arm.kick()
         cell.clock.sleep(PERIOD_S)

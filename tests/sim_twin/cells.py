@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 
 from robotcell import kinematics
 from robotcell.cell import Cell, open_cell
@@ -17,6 +16,8 @@ from sim_twin.gripper import TwinGripper
 from sim_twin.shapes import block
 
 if TYPE_CHECKING:
+    import pytest
+
     from sim_twin.world import World
 
 PERIOD_S = 0.008

@@ -34,9 +34,9 @@ def test_the_flange_is_where_the_kinematics_puts_it():
 
 def test_follows_a_path_at_full_speed_to_a_tenth_of_a_millimetre(cell):
     start = cell.arm.state().q
-    cell.arm.start_joints(start + (0.8, -0.3, 0.2, 0.4, -0.6, 1.5), 3.0, 8.0)
+    cell.arm.start_joints(start + np.array((0.8, -0.3, 0.2, 0.4, -0.6, 1.5)), 3.0, 8.0)
     finish(cell)
-    T = kinematics.forward(start + (0.8, -0.3, 0.2, 0.4, -0.6, 1.5))
+    T = kinematics.forward(start + np.array((0.8, -0.3, 0.2, 0.4, -0.6, 1.5)))
     assert np.linalg.norm(kinematics.forward(cell.arm.state().q)[:3, 3] - T[:3, 3]) < 1e-4
 
 
@@ -76,7 +76,7 @@ def test_a_motion_faster_than_the_motors_allow_ends_in_a_protective_stop(cell):
     cell.arm.start_joints(joints_at(tool_down(-0.65, 0.10, 0.35)), 1.5, 1.4)
     finish(cell)
     # Raising the stretched arm at 40 rad/s^2 takes more than the shoulder's 150 N m.
-    cell.arm.start_joints(cell.arm.state().q + (0, -0.8, 0, 0, 0, 0), np.pi, 40.0)
+    cell.arm.start_joints(cell.arm.state().q + np.array((0, -0.8, 0, 0, 0, 0)), np.pi, 40.0)
     finish(cell)
     assert cell.arm.state().mode is ArmMode.PROTECTIVE_STOP
 
