@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from robotcell.errors import ConfigError
@@ -37,6 +38,8 @@ _SAME_FACE_COSINE = 0.999
 _FACE_THICKNESS_M = 0.0005
 # A face that the centre of mass is this far inside of is not tipped over by a touch.
 _STABLE_MARGIN_M = 0.001
+# Pieces closer than twice this hold together.
+_TOUCH_M = 0.00025
 
 
 @dataclass(frozen=True)
@@ -87,12 +90,13 @@ def novel_shape(number: int) -> Shape:
 
 @cache
 def is_graspable(number: int) -> bool:
-    """Whether the object fits between the fingers, and is not too flat, however it comes to rest."""
+    """Whether the object is one solid that fits between the fingers, and is not too flat, however it comes to rest."""
     try:
-        poses = resting_poses(novel_shape(number))
+        shape = novel_shape(number)
     except ConfigError:
         return False  # one of the files holds NaN
-    return all(pose.width_m <= MAX_GRASP_WIDTH_M and pose.height_m >= MIN_HEIGHT_M for pose in poses)
+    fits = all(pose.width_m <= MAX_GRASP_WIDTH_M and pose.height_m >= MIN_HEIGHT_M for pose in resting_poses(shape))
+    return fits and _is_connected(shape.parts)
 
 
 def resting_poses(shape: Shape) -> Iterator[RestingPose]:
@@ -115,6 +119,28 @@ def resting_poses(shape: Shape) -> Iterator[RestingPose]:
         flat = solid.vertices @ np.linalg.svd(down[None])[2][1:].T
         if _margin(flat[depth > depth.max() - _FACE_THICKNESS_M]) > _STABLE_MARGIN_M:
             yield RestingPose(down, float(np.ptp(depth)), _smallest_width(flat))
+
+
+def _is_connected(parts: tuple[Mesh, ...]) -> bool:
+    """Whether convex parts hold together; some files have pieces that float beside the rest."""
+    planes = [ConvexHull(part.vertices).equations for part in parts]
+    reached, waiting = [0], list(range(1, len(parts)))
+    while waiting:
+        touching = [i for i in waiting if any(_touch(planes[i], planes[j]) for j in reached)]
+        if not touching:
+            return False
+        reached = touching
+        waiting = [i for i in waiting if i not in touching]
+    return True
+
+
+def _touch(planes: Array, other: Array) -> bool:
+    """Whether two convex bodies, each given by its planes (N, 4), share a point when grown by `_TOUCH_M`."""
+    both = np.vstack([planes, other])
+    # The point x that is deepest in both, at depth t: n x + d + t <= 0 for every plane.
+    coefficients = np.column_stack([both[:, :3], np.ones(len(both))])
+    result = linprog([0, 0, 0, -1], A_ub=coefficients, b_ub=-both[:, 3], bounds=[(None, None)] * 4)
+    return result.x is not None and bool(result.x[3] > -_TOUCH_M)
 
 
 def _margin(face: Array) -> float:

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from robotcell.errors import ConfigError
-from sim_twin.meshes import mesh_centroid
+from sim_twin.meshes import Mesh, mesh_centroid
 from sim_twin.novel import is_graspable, novel_shape, novel_shapes, resting_poses
-from sim_twin.shapes import block
+from sim_twin.shapes import block, shape_of
 
 
 def test_a_plank_rests_on_each_of_its_six_faces():
@@ -30,6 +30,16 @@ def test_drawn_objects_fit_the_gripper_however_they_lie_and_differ():
 def test_the_same_seed_draws_the_same_objects():
     names = [[s.name for s in novel_shapes(2, np.random.default_rng(3))] for _ in range(2)]
     assert names[0] == names[1]
+
+
+def test_an_object_in_two_pieces_is_not_graspable(monkeypatch):
+    cube = block("cube").mesh
+    whole, broken = (
+        shape_of("pair", (cube, Mesh(cube.vertices + np.array([gap, 0, 0]), cube.triangles))) for gap in (0.02, 0.06)
+    )
+    for shape, expected in ((whole, True), (broken, False)):
+        monkeypatch.setattr("sim_twin.novel.novel_shape", lambda _, shape=shape: shape)
+        assert is_graspable.__wrapped__(0) is expected
 
 
 def test_a_file_without_a_shape_is_not_graspable():
