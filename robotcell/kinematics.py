@@ -62,7 +62,10 @@ def jacobian(q: npt.ArrayLike) -> Array:
     frames = link_frames(q)
     axes = frames[..., :6, :3, 2]
     arms = frames[..., 6, None, :3, 3] - frames[..., :6, :3, 3]
-    return np.concatenate([np.swapaxes(np.cross(axes, arms), -1, -2), np.swapaxes(axes, -1, -2)], axis=-2)
+    # axes x arms, several times faster than np.cross on so few numbers; the guard needs it in every period.
+    turned, turned_twice = [1, 2, 0], [2, 0, 1]
+    linear = axes[..., turned] * arms[..., turned_twice] - axes[..., turned_twice] * arms[..., turned]
+    return np.concatenate([np.swapaxes(linear, -1, -2), np.swapaxes(axes, -1, -2)], axis=-2)
 
 
 def distance_to_singularity(q: npt.ArrayLike) -> npt.NDArray[np.float64]:
