@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.grasping import DIRECTIONS, Grasps, Jaw, find_grasps, lay_table
-from policy.pushing import Pushes, find_pushes
+from policy.pushing import find_pushes
 from policy.surface import Surface, cell_centers, estimate_surface
 from robotcell.decision import ROTATIONS, Action, Primitive
 from robotcell.errors import NoTarget
@@ -28,7 +28,7 @@ _SAME_M = 0.020
 
 
 class HeuristicPolicy:
-    """Takes the best clear grasp; else, if it may, the best push; else the best grasp that there is.
+    """Takes the best clear grasp; else, if it may, a useful push; else the best of what there is.
 
     Args:
         config: of the cell: gripper, camera position, table, workspace and length of a push.
@@ -54,20 +54,19 @@ class HeuristicPolicy:
             raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
         heightmap = observation.heightmap
         surface = estimate_surface(heightmap, self._camera, self._table_height_m)
-        labels = _owners(observation)
-        table = lay_table(surface, labels, heightmap.workspace.resolution_m, self._jaw.opening_m)
+        table = lay_table(surface, _owners(observation), heightmap.workspace.resolution_m, self._jaw.opening_m)
         grasp = self._best_grasp(find_grasps(table, targets, self._jaw), observation)
         if grasp is not None and grasp.q_value >= CLEAR_GRASP:
             return grasp
-        if observation.may_push:
-            push = self._best_push(surface, labels, observation)
-            if push is not None:
-                return push
-        if grasp is None:
-            raise NoTarget(
-                "no grasp fits and no push would help; rearrange the objects by hand, or choose another goal"
-            )
-        return grasp
+        push = self._best_push(surface, observation) if observation.may_push else None
+        if push is not None and (grasp is None or push.q_value >= USEFUL_PUSH):
+            return push
+        if grasp is not None:
+            return grasp
+        raise NoTarget(
+            f"no grasp fits and no push {'would help' if observation.may_push else 'is allowed any more'}; "
+            "rearrange the objects by hand, or choose another goal"
+        )
 
     def _best_grasp(self, grasps: Grasps, observation: Observation) -> Action | None:
         score = grasps.score.copy()
@@ -86,18 +85,16 @@ class HeuristicPolicy:
             float(score[best]),
         )
 
-    def _best_push(self, surface: Surface, labels: npt.NDArray[np.int32], observation: Observation) -> Action | None:
+    def _best_push(self, surface: Surface, observation: Observation) -> Action | None:
         goal = None if observation.goal is None else 1
+        labels = _instances(observation)
         pushes = find_pushes(surface, labels, goal, observation.heightmap.workspace, self._push_m)
-        return self._choose_push(pushes, observation)
-
-    def _choose_push(self, pushes: Pushes, observation: Observation) -> Action | None:
         score = pushes.score.copy()
         x, y = cell_centers(observation.heightmap.workspace, pushes.row, pushes.col)
         for barred in observation.barred:
             if barred.primitive is Primitive.PUSH:
                 score[_same(x, y, pushes.rotation, barred, ROTATIONS)] = 0
-        if not len(score) or score.max() < USEFUL_PUSH:
+        if not score.any():
             return None
         best = int(score.argmax())
         return self._action(
@@ -122,12 +119,18 @@ class HeuristicPolicy:
 
 
 def _owners(observation: Observation) -> npt.NDArray[np.int32]:
-    """(H, W) labels of the objects; a goal is label 1."""
-    labels = segment(observation.heightmap).labels
+    """(H, W) labels that tell what is to be grasped from its neighbours: a goal is 1, whatever else is 2."""
     if observation.goal is None:
-        return np.where(observation.objects, labels, 0).astype(np.int32)
-    others = np.where(observation.objects & ~observation.goal & (labels > 0), labels + 1, 0)
-    return np.where(observation.goal, 1, others).astype(np.int32)
+        return _instances(observation)
+    return np.where(observation.goal, 1, np.where(observation.objects, 2, 0)).astype(np.int32)
+
+
+def _instances(observation: Observation) -> npt.NDArray[np.int32]:
+    """(H, W) labels of the objects; a goal is 1."""
+    labels = np.where(observation.objects, segment(observation.heightmap).labels, 0)
+    if observation.goal is None:
+        return labels.astype(np.int32)
+    return np.where(observation.goal, 1, np.where(labels > 0, labels + 1, 0)).astype(np.int32)
 
 
 def _same(

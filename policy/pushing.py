@@ -30,10 +30,12 @@ _FREE_HEIGHT_M = 0.008
 # A shadow lower than this hides no block (the lowest is 25 mm high).
 _HIDDEN_HEIGHT_M = 0.020
 # Starts are tried this far from the object's outline, and this far to the side of its middle.
-_STANDOFF_M = (0.008, 0.016, 0.026)
+_STANDOFF_M = (0.008, 0.016, 0.026, 0.040, 0.056)
 _ASIDE_M = (-0.024, -0.016, -0.008, 0.0, 0.008, 0.016, 0.024)
 # Border of a goal: paper, ten dilations of 2 mm.
 _BORDER_M = 0.020
+# Worth of a push that frees no border, yet moves goal and neighbours apart: what is last tried in a heap.
+_STIR = 0.05
 # Objects are considered for a push when they are this near to the goal.
 _NEIGHBOUR_M = 0.030
 # The middle of a pushed object should stay this far inside the workspace.
@@ -77,6 +79,7 @@ class _Scene:
         xy: (M, 2) positions [m] of the object cells of the coarse grid.
         owner: (M,) which object each belongs to.
         centroid: (N, 2) of the objects [m].
+        radius: (N,) distance of their outermost cells from that [m].
         top_m: (N,) their heights.
     """
 
@@ -85,6 +88,7 @@ class _Scene:
     xy: Array
     owner: npt.NDArray[np.intp]
     centroid: Array
+    radius: Array
     top_m: Array
 
     @property
@@ -132,12 +136,17 @@ def _scene(surface: Surface, labels: npt.NDArray[np.int32], workspace: Workspace
     count = int(labels.max())
     heights = surface.height_m[::step, ::step][rows, cols]
     cells = np.maximum(np.bincount(owner, minlength=count), 1)
+    xy = np.column_stack([x, y])
+    centroid = np.column_stack([np.bincount(owner, v, count) / cells for v in (x, y)])
+    radius = np.zeros(count)
+    np.maximum.at(radius, owner, np.linalg.norm(xy - centroid[owner], axis=1))
     return _Scene(
         labels=labels,
         workspace=workspace,
-        xy=np.column_stack([x, y]),
+        xy=xy,
         owner=owner,
-        centroid=np.column_stack([np.bincount(owner, v, count) / cells for v in (x, y)]),
+        centroid=centroid,
+        radius=radius,
         top_m=np.array([np.percentile(heights[owner == i], 90) if (owner == i).any() else 0.0 for i in range(count)]),
     )
 
@@ -157,6 +166,7 @@ class _Strips:
     Attributes:
         along, aside: (2,) unit vectors of the direction and of its normal.
         back, front: (N, strips) where each object begins and ends in each strip [m]; infinite where it is not.
+        swept: (N, strips) where each object begins in what fingers that run in that strip sweep.
         first: number of the first strip; strip b covers (b - 0.5 .. b + 0.5) grid steps aside.
         gap: (N, N) how far i can move before it meets j [m]; infinite where it never does.
     """
@@ -165,6 +175,7 @@ class _Strips:
     aside: Array
     back: Array
     front: Array
+    swept: Array
     first: int
     gap: Array
 
@@ -183,7 +194,10 @@ def _strips(scene: _Scene, along: Array) -> _Strips:
     middle = np.where(present, np.where(present, back, 0) + np.where(present, front, 0), np.nan)
     ahead = middle[None] > middle[:, None]  # False where either is not in the strip
     gap = np.where(ahead, np.maximum(back[None] - front[:, None], 0), np.inf).min(axis=2)
-    return _Strips(along, aside, back, front, first, gap)
+    half = int(_HALF_WIDTH_M / _GRID_M)
+    wide = np.pad(back, ((0, 0), (half, half)), constant_values=np.inf)
+    swept = np.min([wide[:, i : i + back.shape[1]] for i in range(2 * half + 1)], axis=0)
+    return _Strips(along, aside, back, front, swept, first, gap)
 
 
 def _pushes_along(
@@ -197,13 +211,15 @@ def _pushes_along(
         return _no_pushes()
     moved, first_met = _play(starts, strips, push_m)
     shift = moved[:, [target]] - moved
-    useful = np.flatnonzero((np.abs(shift[:, neighbours]) > _GRID_M).any(axis=1))
+    apart = np.abs(shift[:, neighbours]).max(axis=1, initial=0)
+    useful = np.flatnonzero(apart > _GRID_M)
     if not len(useful):
         return _no_pushes()
     starts, moved, first_met, shift = starts[useful], moved[useful], first_met[useful], shift[useful]
     before = _occupied(border, scene, target, np.zeros((1, scene.count)), strips.along)
     after = _occupied(border, scene, target, shift, strips.along)
-    score = np.clip(before - after, 0, 1) * _certainty(starts, moved, first_met, target, scene, strips)
+    gain = np.clip(before - after, 0, 1) + _STIR * np.minimum(apart[useful] / _BORDER_M, 1)
+    score = np.minimum(gain, 1) * _certainty(starts, moved, first_met, target, scene, strips)
     x, y = starts.T
     row = np.floor((y - scene.workspace.y[0]) / scene.workspace.resolution_m).astype(np.intp)
     col = np.floor((x - scene.workspace.x[0]) / scene.workspace.resolution_m).astype(np.intp)
@@ -238,22 +254,14 @@ def _labels_near(scene: _Scene, target: int) -> list[int]:
 
 def _starts(movers: list[int], scene: _Scene, strips: _Strips, free: npt.NDArray[np.bool_]) -> Array:
     """(S, 2) places behind the objects where the closed fingers can come down [m]."""
-    starts = []
-    for mover in movers:
-        own = np.flatnonzero(np.isfinite(strips.back[mover]))
-        for aside in _ASIDE_M:
-            b = float(scene.centroid[mover] @ strips.aside) + aside
-            strip = round(b / _GRID_M) - strips.first
-            if strip < own[0] or strip > own[-1]:
-                continue
-            reach = own[np.abs(own - strip) * _GRID_M <= _HALF_WIDTH_M]
-            if not len(reach):
-                continue
-            a = float(strips.back[mover, reach].min()) - _HALF_LENGTH_M
-            starts += [(a - standoff) * strips.along + b * strips.aside for standoff in _STANDOFF_M]
-    if not starts:
-        return np.zeros((0, 2))
-    xy = np.array(starts)
+    mover = np.repeat(np.array(movers, np.intp), len(_ASIDE_M))
+    b = scene.centroid[mover] @ strips.aside + np.tile(_ASIDE_M, len(movers))
+    strip = np.rint(b / _GRID_M).astype(np.intp) - strips.first
+    on = (strip >= 0) & (strip < strips.back.shape[1])
+    on &= np.isfinite(strips.back[mover, np.where(on, strip, 0)])
+    mover, b, strip = mover[on], b[on], strip[on]
+    a = strips.swept[mover, strip] - _HALF_LENGTH_M - np.array(_STANDOFF_M)[:, None]
+    xy = a.reshape(-1, 1) * strips.along + np.tile(b, len(_STANDOFF_M))[:, None] * strips.aside
     workspace = scene.workspace
     row = np.floor((xy[:, 1] - workspace.y[0]) / workspace.resolution_m).astype(np.intp)
     col = np.floor((xy[:, 0] - workspace.x[0]) / workspace.resolution_m).astype(np.intp)
@@ -264,12 +272,9 @@ def _starts(movers: list[int], scene: _Scene, strips: _Strips, free: npt.NDArray
 def _play(starts: Array, strips: _Strips, push_m: float) -> tuple[Array, npt.NDArray[np.intp]]:
     """How far each object moves (S, N) [m], and which one each push meets first (S,)."""
     a, b = starts @ strips.along, starts @ strips.aside
-    half = int(_HALF_WIDTH_M / _GRID_M)
-    middle = np.rint(b / _GRID_M).astype(np.intp) - strips.first
-    swept = middle[:, None] + np.arange(-half, half + 1)
-    inside = (swept >= 0) & (swept < strips.back.shape[1])
-    back = np.where(inside, strips.back[:, np.where(inside, swept, 0)], np.inf)
-    ahead = np.where(back > a[:, None], back, np.inf).min(axis=2).T
+    strip = np.rint(b / _GRID_M).astype(np.intp) - strips.first
+    begin = strips.swept[:, strip].T
+    ahead = np.where(begin > a[:, None], begin, np.inf)
     way = np.maximum(ahead - a[:, None] - _HALF_LENGTH_M, 0)
     moved = np.clip(push_m - way, 0, None)
     for _ in range(_CHAIN):
@@ -281,14 +286,18 @@ def _occupied(border: Array, scene: _Scene, target: int, shift: Array, along: Ar
     """(S,) share of the target's border that others occupy once each has moved by -shift (S, N) against it."""
     workspace = scene.workspace
     taken = np.zeros((len(shift), len(border)), np.bool_)
-    for other in range(scene.count):
-        if other == target:
-            continue
-        xy = border + shift[:, other, None, None] * along
+    reach = np.linalg.norm(border - scene.centroid[target], axis=1).max() + np.abs(shift).max(axis=0)
+    near = np.linalg.norm(scene.centroid - scene.centroid[target], axis=1) < reach + scene.radius
+    near[target] = False
+    for other in np.flatnonzero(near):
+        # Most pushes leave most objects where they are: look each shift up once.
+        steps, which = np.unique(np.rint(shift[:, other] / _GRID_M), return_inverse=True)
+        xy = border + (steps * _GRID_M)[:, None, None] * along
         row = np.floor((xy[..., 1] - workspace.y[0]) / workspace.resolution_m).astype(np.intp)
         col = np.floor((xy[..., 0] - workspace.x[0]) / workspace.resolution_m).astype(np.intp)
         inside = (row >= 0) & (row < scene.labels.shape[0]) & (col >= 0) & (col < scene.labels.shape[1])
-        taken |= inside & (scene.labels[np.where(inside, row, 0), np.where(inside, col, 0)] == other + 1)
+        hit = scene.labels[np.where(inside, row, 0), np.where(inside, col, 0)] == other + 1
+        taken |= (inside & hit)[which]
     return np.asarray(taken.mean(axis=1), np.float64)
 
 

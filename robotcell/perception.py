@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import find_objects
 
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.palette import PALETTE
@@ -215,16 +216,16 @@ def _split_necks(labels: npt.NDArray[np.int32], resolution_m: float) -> npt.NDAr
     depths = _depths(labels)
     result: npt.NDArray[np.int32] = labels.copy()
     following = int(labels.max()) + 1
-    for label in range(1, int(labels.max()) + 1):
-        whole = labels == label
-        if np.count_nonzero(whole) < 2 * smallest:
+    for label, box in enumerate(find_objects(labels), start=1):
+        if box is None:
             continue
-        rows, cols = _bounds(whole)
-        inner, depth = whole[rows, cols], depths[rows, cols]
+        inner, depth = labels[box] == label, depths[box]
+        if np.count_nonzero(inner) < 2 * smallest:
+            continue
         parts = _necked_parts(inner, np.where(inner, depth, 0), narrowest)
         if parts is None:
             continue
-        window = result[rows, cols]
+        window = result[box]
         for part in range(2, int(parts.max()) + 1):
             window[inner & (parts == part)] = following
             following += 1
@@ -255,19 +256,22 @@ def _merge_fragments(labels: npt.NDArray[np.int32], resolution_m: float) -> npt.
     cells = np.bincount(labels.ravel(), minlength=count)
     fragments = [n for n in range(1, count) if cells[n] and (cells[n] < smallest or depth[n] < narrowest / 2)]
     labels = labels.copy()
+    boxes: dict[int, _Box] = {n: box for n, box in enumerate(find_objects(labels), start=1) if box}
     kernel = np.ones((3, 3), np.uint8)
     for fragment in sorted(fragments, key=lambda n: cells[n]):
-        rows, cols = _bounds(labels == fragment, margin=1)
-        window = labels[rows, cols]
+        box = _grown(boxes[fragment])
+        window = labels[box]
         inner = window == fragment
         rim = window[(cv2.dilate(inner.astype(np.uint8), kernel) > 0) & ~inner & (window > 0)]
         if len(rim):
-            window[inner] = np.bincount(rim).argmax()
+            host = int(np.bincount(rim).argmax())
+            window[inner] = host
+            boxes[host] = _union(boxes[host], box)
     return labels
 
 
 def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentation:
-    """Number the instances from the largest and measure them."""
+    """Number the instances from the largest and measure them; those of which no cell was seen are left out."""
     seen = np.isfinite(heightmap.height_m)
     values, counts = np.unique(labels[(labels > 0) & seen], return_counts=True)
     order = np.argsort(-counts, kind="stable")
@@ -275,16 +279,18 @@ def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentati
     renumber[values[order]] = np.arange(1, len(values) + 1)
     labels = renumber[labels]
     instances = []
-    for label in range(1, len(values) + 1):
-        mask = labels == label
+    for label, box in enumerate(find_objects(labels), start=1):
+        mask = labels[box] == label
+        known = mask & seen[box]
         rows, cols = np.nonzero(mask)
-        known = mask & seen
         instances.append(
             Instance(
                 label=label,
-                color_name=_name(heightmap.color[known]),
-                centroid=heightmap.workspace.position(float(rows.mean()), float(cols.mean())),
-                height_m=float(np.percentile(heightmap.height_m[known], 95)),
+                color_name=_name(heightmap.color[box][known]),
+                centroid=heightmap.workspace.position(
+                    box[0].start + float(rows.mean()), box[1].start + float(cols.mean())
+                ),
+                height_m=float(np.percentile(heightmap.height_m[box][known], 95)),
                 cells=len(rows),
             )
         )
@@ -297,12 +303,19 @@ def _name(colors: npt.NDArray[np.uint8]) -> str:
     return list(PALETTE)[int(_distances(np.median(features, axis=0)[None]).argmin())]
 
 
-def _bounds(mask: npt.NDArray[np.bool_], margin: int = 0) -> tuple[slice, slice]:
-    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return (
-        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + 1 + margin),
-        slice(max(0, int(cols[0]) - margin), int(cols[-1]) + 1 + margin),
-    )
+_Box: TypeAlias = tuple[slice, slice]
+
+
+def _grown(box: _Box) -> _Box:
+    """A box with one more cell on each side; slices end at the edge of the map by themselves."""
+    rows, cols = box
+    return slice(max(0, rows.start - 1), rows.stop + 1), slice(max(0, cols.start - 1), cols.stop + 1)
+
+
+def _union(a: _Box, b: _Box) -> _Box:
+    """The smallest box that holds both."""
+    rows, cols = (slice(min(i.start, j.start), max(i.stop, j.stop)) for i, j in zip(a, b, strict=True))
+    return rows, cols
 
 
 def _cells(length_m: float, resolution_m: float) -> int:
