@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
 from robotcell.errors import ConfigError
@@ -38,8 +37,8 @@ _SAME_FACE_COSINE = 0.999
 _FACE_THICKNESS_M = 0.0005
 # A face that the centre of mass is this far inside of is not tipped over by a touch.
 _STABLE_MARGIN_M = 0.001
-# Pieces closer than twice this hold together.
-_TOUCH_M = 0.00025
+# Pieces closer than this hold together.
+_GAP_M = 0.0005
 
 
 @dataclass(frozen=True)
@@ -124,23 +123,19 @@ def resting_poses(shape: Shape) -> Iterator[RestingPose]:
 def _is_connected(parts: tuple[Mesh, ...]) -> bool:
     """Whether convex parts hold together; some files have pieces that float beside the rest."""
     planes = [ConvexHull(part.vertices).equations for part in parts]
-    reached, waiting = [0], list(range(1, len(parts)))
-    while waiting:
-        touching = [i for i in waiting if any(_touch(planes[i], planes[j]) for j in reached)]
-        if not touching:
-            return False
-        reached = touching
-        waiting = [i for i in waiting if i not in touching]
-    return True
 
+    def apart(i: int, j: int) -> bool:
+        # The bodies have a face of one of them between them, as pieces of one cut solid do.
+        outside = parts[j].vertices @ planes[i][:, :3].T + planes[i][:, 3]
+        return bool(outside.min(axis=0).max() > _GAP_M)
 
-def _touch(planes: Array, other: Array) -> bool:
-    """Whether two convex bodies, each given by its planes (N, 4), share a point when grown by `_TOUCH_M`."""
-    both = np.vstack([planes, other])
-    # The point x that is deepest in both, at depth t: n x + d + t <= 0 for every plane.
-    coefficients = np.column_stack([both[:, :3], np.ones(len(both))])
-    result = linprog([0, 0, 0, -1], A_ub=coefficients, b_ub=-both[:, 3], bounds=[(None, None)] * 4)
-    return result.x is not None and bool(result.x[3] > -_TOUCH_M)
+    reached, waiting = [0], set(range(1, len(parts)))
+    while reached:
+        piece = reached.pop()
+        touching = {i for i in waiting if not (apart(i, piece) or apart(piece, i))}
+        waiting -= touching
+        reached += touching
+    return not waiting
 
 
 def _margin(face: Array) -> float:
