@@ -256,7 +256,7 @@ def _merge_fragments(labels: npt.NDArray[np.int32], resolution_m: float) -> npt.
     cells = np.bincount(labels.ravel(), minlength=count)
     fragments = [n for n in range(1, count) if cells[n] and (cells[n] < smallest or depth[n] < narrowest / 2)]
     labels = labels.copy()
-    boxes: dict[int, _Box] = {n: box for n, box in enumerate(find_objects(labels), start=1) if box}
+    boxes: dict[int, _Box] = {n: (box[0], box[1]) for n, box in enumerate(find_objects(labels), start=1) if box}
     kernel = np.ones((3, 3), np.uint8)
     for fragment in sorted(fragments, key=lambda n: cells[n]):
         box = _grown(boxes[fragment])
