@@ -12,6 +12,7 @@ from sim_twin.noise import NoiseOptions
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
+    from sim_twin.world import World
 
 
 class TwinOptions(BaseModel):
@@ -42,18 +43,18 @@ class TwinBackend:
     @staticmethod
     def open(config: CellConfig) -> Cell:
         """The twin of a configuration, not yet connected."""
-        from sim_twin.arm import TwinArm
-        from sim_twin.camera import TwinCamera
-        from sim_twin.clock import TwinClock
-        from sim_twin.gripper import TwinGripper
-        from sim_twin.world import World
+        return open_twin(config)[0]
 
-        options = TwinOptions.model_validate(config.backend.options)
-        world = World(config, options)
-        return Cell(
-            config,
-            TwinArm(world),
-            TwinGripper(world),
-            TwinCamera(world, config.camera, options.noise, options.seed),
-            TwinClock(world),
-        )
+
+def open_twin(config: CellConfig) -> tuple[Cell, World]:
+    """The twin of a configuration, not yet connected, and the world behind it, to score results by."""
+    from sim_twin.arm import TwinArm
+    from sim_twin.camera import TwinCamera
+    from sim_twin.clock import TwinClock
+    from sim_twin.gripper import TwinGripper
+    from sim_twin.world import World
+
+    options = TwinOptions.model_validate(config.backend.options)
+    world = World(config, options)
+    camera = TwinCamera(world, config.camera, options.noise, options.seed)
+    return Cell(config, TwinArm(world), TwinGripper(world), camera, TwinClock(world)), world
