@@ -42,6 +42,8 @@ _NECK = 0.5
 # The table is no reference for the white balance, since a real one need not be neutral.
 _LIGHTNESS = 66.0
 _LIGHTNESS_WEIGHT = 0.3
+# Cells of an instance that its median colour is taken of.
+_MEDIAN_CELLS = 300
 # Colour distances beyond this are all the same: one odd cell must not outvote its surroundings.
 _FAR = 40.0
 
@@ -299,7 +301,7 @@ def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentati
 
 def _name(colors: npt.NDArray[np.uint8]) -> str:
     """The palette colour of an instance's (N, 3) cells: of their median, which noise and rims do not move."""
-    features = _features(colors)
+    features = _features(colors[:: max(1, len(colors) // _MEDIAN_CELLS)])
     return list(PALETTE)[int(_distances(np.median(features, axis=0)[None]).argmin())]
 
 

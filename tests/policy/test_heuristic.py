@@ -16,7 +16,6 @@ from robotcell.palette import PALETTE
 from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
-ROWS, COLS = Workspace().shape
 MIDDLE = (-0.5, 0.0)
 
 
@@ -28,11 +27,12 @@ def policy():
 class Scene:
     """Boxes on a flat table, as a heightmap without noise."""
 
-    def __init__(self):
-        self.heights = np.zeros((ROWS, COLS), np.float32)
-        self.colors = np.full((ROWS, COLS, 3), 90, np.uint8)
-        cols, rows = np.meshgrid(np.arange(COLS), np.arange(ROWS))
-        self.x, self.y = Workspace().position(rows, cols)
+    def __init__(self, workspace=None):
+        self.workspace = workspace or Workspace()
+        rows, cols = np.indices(self.workspace.shape)
+        self.x, self.y = self.workspace.position(rows, cols)
+        self.heights = np.zeros(self.workspace.shape, np.float32)
+        self.colors = np.full((*self.workspace.shape, 3), 90, np.uint8)
 
     def footprint(self, center, size, angle=0.0):
         dx, dy = self.x - center[0], self.y - center[1]
@@ -49,7 +49,7 @@ class Scene:
         self.heights[self.footprint(center, size)] = np.nan
 
     def look(self, goal=None, barred=(), *, may_push=True):
-        view = replace(heightmap(self.heights), color=self.colors)
+        view = replace(heightmap(self.heights, self.workspace), color=self.colors)
         return Observation(view, np.nan_to_num(self.heights) > 0.01, goal, barred, may_push)
 
 
@@ -65,7 +65,7 @@ def packed_goal():
 def finger_cells(scene, action):
     """Cells under the open fingers."""
     reach = (CONFIG.gripper.preshape_m + linkage.FINGER_THICKNESS_M) / 2
-    under = np.zeros((ROWS, COLS), bool)
+    under = np.zeros(scene.heights.shape, bool)
     for side in (reach, -reach):
         center = (action.xyz[0] + side * math.cos(action.theta), action.xyz[1] + side * math.sin(action.theta))
         under |= scene.footprint(center, (linkage.FINGER_THICKNESS_M, linkage.FINGER_BREADTH_M), action.theta)
@@ -90,6 +90,17 @@ def test_a_lone_cube_is_grasped_square_and_in_the_middle(x, y, angle, height):
     assert abs(askew) <= math.pi / 16 + 0.09  # half a step of 22.5 degrees, and what the cells blur
     assert action.xyz[2] == pytest.approx(height, abs=1e-3)
     assert Workspace().cell(*action.xyz[:2]) == (action.row, action.col)
+
+
+@pytest.mark.parametrize("resolution_m", [0.001, 0.004, 0.007])
+def test_cells_of_any_size_will_do(resolution_m):
+    workspace = Workspace(x=(-0.65, -0.35), y=(-0.1, 0.1), resolution_m=resolution_m)
+    scene = Scene(workspace)
+    goal = scene.box((-0.52, 0.02), angle=0.4)
+    scene.box((-0.45, -0.04), angle=0.1, color="blue")
+    action = make_policy("heuristic", CellConfig(workspace=workspace)).decide(scene.look(goal))
+    assert action.primitive is Primitive.GRASP
+    assert math.hypot(action.xyz[0] + 0.52, action.xyz[1] - 0.02) < 0.015
 
 
 @given(angle=st.floats(0, math.pi))
