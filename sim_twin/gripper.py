@@ -19,16 +19,18 @@ if TYPE_CHECKING:
     from robotcell.geometry import Array
     from sim_twin.world import World
 
-# Opening speed of the tips. Assumed: between the 55 and 184 mm/s per finger pair of OnRobot's data sheet for the RG2.
+# Of the opening: the whole stroke in a second. Assumed.
 WIDTH_SPEED_M_S = 0.11
 # The fingers are where they should be within this.
 _REACHED_M = 0.0002
 # Stopped short of the commanded width by more than this, the fingers hold something.
 GRIP_TOLERANCE_M = 0.001
-# Slower than this for that many steps, the fingers were stopped; they move on when they leave the place by more.
+# Slower than this for that many steps, the fingers were stopped; faster than that for so many, they are free again.
+# What is held may creep or jerk a little in between.
 _STILL_M_S = 0.004
 _STILL_STEPS = 12
-_GIVEN_WAY_M = 0.003
+_FREE_M_S = 0.03
+_FREE_STEPS = 16
 # The worm drive cannot be pushed back: at rest the cranks hold with this torque.
 _HOLDING_TORQUE_NM = 20.0
 # Share of the remaining way that the fingers may cover within a step, so that they do not overshoot.
@@ -46,8 +48,8 @@ class TwinGripper:
         self._force_n = 0.0
         self._driving = False
         self._still_steps = 0
-        # The width at which something stopped the fingers.
-        self._stopped_at_m: float | None = None
+        self._free_steps = 0
+        self._stopped = False
 
     def __enter__(self) -> Self:
         self.connect()
@@ -80,12 +82,11 @@ class TwinGripper:
         """The state after the last step."""
         self._need_connection()
         width = _width(self._world.joint_states(self._cranks)[0])
-        stopped = self._stopped_at_m is not None
         return GripperState(
             t=self._world.time_s,
             width_m=width,
-            busy=self._driving and not stopped,
-            grip_detected=self._driving and stopped and abs(width - self._target_m) > GRIP_TOLERANCE_M,
+            busy=self._driving and not self._stopped,
+            grip_detected=self._driving and self._stopped and abs(width - self._target_m) > GRIP_TOLERANCE_M,
         )
 
     def start_width(self, width_m: float, force_n: float) -> None:
@@ -99,9 +100,8 @@ class TwinGripper:
         _check_range("force", force_n, linkage.MIN_FORCE_N, linkage.MAX_FORCE_N, "N")
         if (width_m, force_n) != (self._target_m, self._force_n):
             self._target_m, self._force_n = width_m, force_n
+            self._forget_motion()
             self._driving = True
-            self._still_steps = 0
-            self._stopped_at_m = None
 
     def stop(self) -> None:
         """Hold the fingers where they are."""
@@ -125,17 +125,24 @@ class TwinGripper:
         lever = linkage.CRANK_LENGTH_M * math.cos(angle)
         speed = math.copysign(min(WIDTH_SPEED_M_S, _APPROACH * abs(way) / STEP_S), way)
         self._world.drive_speeds(self._cranks, (speed / (2 * lever),) * 2, (self._force_n * lever,) * 2)
-        still = abs(float(rates.sum())) * lever < _STILL_M_S
-        self._still_steps = self._still_steps + 1 if still else 0
-        if self._stopped_at_m is None and self._still_steps >= _STILL_STEPS:
-            self._stopped_at_m = width
-        elif self._stopped_at_m is not None and abs(width - self._stopped_at_m) > _GIVEN_WAY_M:
-            self._still_steps, self._stopped_at_m = 0, None
+        self._judge(abs(float(rates.sum())) * lever)
+
+    def _judge(self, speed: float) -> None:
+        """Tell fingers that something stopped from fingers that move."""
+        self._still_steps = self._still_steps + 1 if speed < _STILL_M_S else 0
+        self._free_steps = self._free_steps + 1 if speed > _FREE_M_S else 0
+        if self._still_steps >= _STILL_STEPS:
+            self._stopped = True
+        elif self._free_steps >= _FREE_STEPS:
+            self._stopped = False
+
+    def _forget_motion(self) -> None:
+        self._still_steps = self._free_steps = 0
+        self._stopped = False
 
     def _hold(self) -> None:
         self._driving = False
-        self._still_steps = 0
-        self._stopped_at_m = None
+        self._forget_motion()
         angle = linkage.crank_angle(self._target_m)
         self._world.drive_positions(self._cranks, (angle,) * 2, (_HOLDING_TORQUE_NM,) * 2, (0.5,) * 2)
 
