@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from robotcell import linkage
 from robotcell.decision import ROTATIONS
+from robotcell.primitives import GRASP_DEPTH_M
 
 if TYPE_CHECKING:
     from policy.surface import Surface
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 # The jaw is symmetric: half a turn changes nothing.
 DIRECTIONS = ROTATIONS // 2
 
-# Paper: the tips go 4 cm below the surface at the chosen cell.
-_DEPTH_M = 0.040
 # What stands this far above the tcp is taken for material that the closed fingers press on: the tips of fingers that
 # hold a 50 mm block are 5 mm above it, and 3 mm of noise must not count as a wall.
 _PRESS_M = 0.008
@@ -30,7 +29,7 @@ _SIDE_MARGIN_M = 0.003
 # The open tips must end at least this far above what is beneath them, and are at ease twice as far.
 _TIP_MARGIN_M = 0.004
 # Measured from the tcp up to the palm (128 mm from the flange) with 10 mm to spare.
-_PALM_M = linkage.CLOSED_LENGTH_M - 0.128 - 0.010
+_PALM_M = linkage.CLOSED_LENGTH_M - linkage.PALM_M - 0.010
 # Slope of a face, and the taper between two faces, at which a grip slips: friction angle of rubber on wood, about
 # 35 degrees.
 _FRICTION = math.tan(math.radians(35))
@@ -152,7 +151,7 @@ def _score(
     if not len(rows):
         return grasps
     k = int(rotation[0])
-    tcp = np.maximum(surface - _DEPTH_M, jaw.tip_clearance_m)
+    tcp = np.maximum(surface - GRASP_DEPTH_M, jaw.tip_clearance_m)
     tip = tcp + np.float32(linkage.tip_retraction(jaw.opening_m))
     room = _finger_room(table, center, tip, k, jaw.opening_m)
     fits = np.flatnonzero(room > 0)

@@ -12,7 +12,6 @@ from policy.pushing import find_pushes
 from policy.surface import Surface, cell_centers, estimate_surface
 from robotcell.decision import ROTATIONS, Action, Primitive
 from robotcell.errors import NoTarget
-from robotcell.perception import segment
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
@@ -127,9 +126,9 @@ def _owners(observation: Observation) -> npt.NDArray[np.int32]:
 
 def _instances(observation: Observation) -> npt.NDArray[np.int32]:
     """(H, W) labels of the objects; a goal is 1."""
-    labels = np.where(observation.objects, segment(observation.heightmap).labels, 0)
+    labels = observation.labels
     if observation.goal is None:
-        return labels.astype(np.int32)
+        return labels
     return np.where(observation.goal, 1, np.where(labels > 0, labels + 1, 0)).astype(np.int32)
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 # Distance of the upper arm's tube from the plane of the base, along the shoulder axis (UR5e drawing: 0.138 m).
 _UPPER_ARM_OFFSET_M = 0.138
 _SPACING_M = 0.03
-# Palm of the RG2, from the flange (its pivots are 126 mm from it).
-_PALM_M = 0.128
 # The camera's housing and its post stand behind its optical centre.
 _CAMERA_HALF_M = 0.06
 _POST_HALF_M = 0.03
@@ -54,7 +52,7 @@ _BODIES = (
     (4, (0.0, -0.1333, 0.0), (0.0, 0.0, 0.0), 0.050),
     (5, (0.0, 0.0997, 0.0), (0.0, 0.0, 0.0), 0.048),
     (6, (0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 0.045),
-    (6, (0.0, 0.0, 0.05), (0.0, 0.0, _PALM_M), 0.055),
+    (6, (0.0, 0.0, 0.05), (0.0, 0.0, linkage.PALM_M), 0.055),
 )
 _GRIPPER = len(_BODIES) - 1
 # Bodies this many places apart in the chain share a joint housing or a neighbour's, and cannot touch.

@@ -55,17 +55,22 @@ class Observation:
 
     Attributes:
         heightmap: the table as the last frame showed it.
-        objects: (H, W) bool, cells that hold an object.
+        labels: (H, W) int32, cells that hold an object carry its number from 1, all others 0.
         goal: (H, W) bool, cells of the goal object, or None when any object will do.
         barred: actions that failed on the scene as it stands; the policy is not to repeat them.
         may_push: whether a push is allowed now.
     """
 
     heightmap: Heightmap
-    objects: npt.NDArray[np.bool_]
+    labels: npt.NDArray[np.int32]
     goal: npt.NDArray[np.bool_] | None
     barred: tuple[Action, ...]
     may_push: bool
+
+    @property
+    def objects(self) -> npt.NDArray[np.bool_]:
+        """(H, W) cells that hold an object."""
+        return self.labels > 0
 
 
 class Policy(Protocol):

@@ -398,9 +398,8 @@ def _observe(view: View, goal: str | None, barred: tuple[Action, ...], *, may_pu
         NoTarget: the goal is not on the table.
     """
     labels = view.segmentation.labels
-    objects = labels > 0
     goal_mask = labels == find_goal(view.segmentation, goal).label if goal is not None else None
-    return Observation(view.heightmap, objects, goal_mask, barred, may_push)
+    return Observation(view.heightmap, labels, goal_mask, barred, may_push)
 
 
 def _taken(decision: Decision, after: View) -> Instance | None:

@@ -13,6 +13,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from robotcell.geometry import make_transform
+
 CRANK_LENGTH_M = 0.055
 CLOSED_ANGLE = -0.0380
 MIN_WIDTH_M = 0.0
@@ -21,6 +25,10 @@ MIN_FORCE_N = 3.0
 MAX_FORCE_N = 40.0
 # Flange to the tips of the closed fingers: the tcp.
 CLOSED_LENGTH_M = 0.213
+# The tcp: between the tips of the closed fingers, axes of the flange. The fingers close along its x axis.
+T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, CLOSED_LENGTH_M))
+# Flange to palm (the pivots of the cranks are 126 mm from the flange).
+PALM_M = 0.128
 # A finger tip, across the closing direction and along it. Measured from the public RG2 models.
 FINGER_BREADTH_M = 0.022
 FINGER_THICKNESS_M = 0.010

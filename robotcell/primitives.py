@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from robotcell.heightmap import Heightmap
     from robotcell.interfaces import ArmState
 
-# The tcp: between the tips of the closed fingers, axes of the flange. The fingers close along its x axis.
-T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, linkage.CLOSED_LENGTH_M))
-
 # Paper, section "Evaluation" of the released code: the finger tips go 4 cm below the surface at the chosen pixel.
 GRASP_DEPTH_M = 0.040
 # A load gripped 4 cm below its top reaches at most this far below the tcp (the tallest block is 100 mm).
@@ -101,7 +98,7 @@ def tool_down(x: float, y: float, z: float, theta: float) -> Array:
 
 def flange_pose(T_base_tcp: Array) -> Array:
     """T_base_flange (..., 4, 4) of tcp poses."""
-    return T_base_tcp @ invert_transform(T_FLANGE_TCP)
+    return T_base_tcp @ invert_transform(linkage.T_FLANGE_TCP)
 
 
 def plan_action(action: Action, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
@@ -154,7 +151,7 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
     theta = action.theta
     q_above = _solve("approach", tool_down(x, y, approach_z, theta), config)
     # The symmetric jaw may have been turned by half a turn to stay near the home pose.
-    T_above = kinematics.forward(q_above) @ T_FLANGE_TCP
+    T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
     T_near, T_grasp = T_above.copy(), T_above.copy()
     highest = table + _highest_under_gripper(heightmap, x, y)
     T_near[2, 3] = float(np.clip(highest + _NEAR_M - linkage.tip_retraction(use.preshape_m), tcp_z, approach_z))
@@ -194,7 +191,7 @@ def _plan_push(action: Action, heightmap: Heightmap, q_start: Array, config: Cel
     tcp_z = table + push_height(action.xyz[2] - table, config)
     approach_z = tcp_z + motion.approach_m
     q_above = _solve("approach", tool_down(x, y, approach_z, action.theta), config)
-    T_above = kinematics.forward(q_above) @ T_FLANGE_TCP
+    T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
     T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
     highest = table + _highest_under_gripper(heightmap, x, y)
     T_near[2, 3] = float(np.clip(highest + _NEAR_M, tcp_z, approach_z))

@@ -16,7 +16,7 @@ from robotcell import collision, kinematics, linkage
 from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
 from robotcell.geometry import Array, interpolate_transforms, rotation_angle
 from robotcell.interfaces import ArmMode, ArmState
-from robotcell.primitives import T_FLANGE_TCP, CheckHold, Grip, JointMove, LinearMove, MotionPlan, flange_pose
+from robotcell.primitives import CheckHold, Grip, JointMove, LinearMove, MotionPlan, flange_pose
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig, KeepOut
@@ -189,7 +189,7 @@ def _linear_path(q: Array, step: LinearMove, config: CellConfig, name: str) -> A
     T_goal = np.asarray(step.T_base_tcp)
     if T_goal.shape != (4, 4) or not np.isfinite(T_goal).all():
         raise UnsafeMotion(f"{name}: the target is not a finite 4x4 transform")
-    T_start = kinematics.forward(q) @ T_FLANGE_TCP
+    T_start = kinematics.forward(q) @ linkage.T_FLANGE_TCP
     length = float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3]))
     angle = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
     count = int(np.ceil(max(length / _LINEAR_STEP_M, angle / _ROTATION_STEP_RAD))) + 1
@@ -222,7 +222,7 @@ def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], conf
             f"{name}: joint {joint} would turn to {path[np.abs(path[:, joint]).argmax(), joint]:.2f} rad "
             f"(limit +-{margin[joint]:.2f} rad)"
         )
-    T_tcp = kinematics.forward(path) @ T_FLANGE_TCP
+    T_tcp = kinematics.forward(path) @ linkage.T_FLANGE_TCP
     tcp = T_tcp[:, :3, 3]
     outside = _outside_box(tcp, config, slack_m=_ROUNDING_M)
     if outside.any():

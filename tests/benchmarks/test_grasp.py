@@ -39,7 +39,7 @@ class Bench:
     def decide(self, view: View) -> Action:
         """The best grasp; pushes would make the rounds unlike each other."""
         action = self.policy.decide(
-            Observation(view.heightmap, view.segmentation.labels > 0, None, barred=(), may_push=False)
+            Observation(view.heightmap, view.segmentation.labels, None, barred=(), may_push=False)
         )
         assert action.primitive is Primitive.GRASP
         return action

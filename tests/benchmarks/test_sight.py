@@ -43,7 +43,7 @@ def observe(heightmap, *, goal):
     segmentation = segment(heightmap)
     largest = segmentation.instances[0]
     mask = segmentation.mask(find_goal(segmentation, largest.color_name)) if goal else None
-    return Observation(heightmap, segmentation.objects, mask, (), True)
+    return Observation(heightmap, segmentation.labels, mask, (), True)
 
 
 @RESOLUTIONS

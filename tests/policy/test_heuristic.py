@@ -13,6 +13,7 @@ from robotcell.config import CameraMount, CellConfig, Workspace
 from robotcell.decision import Observation, Primitive
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.palette import PALETTE
+from robotcell.perception import segment
 from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
@@ -50,7 +51,7 @@ class Scene:
 
     def look(self, goal=None, barred=(), *, may_push=True):
         view = replace(heightmap(self.heights, self.workspace), color=self.colors)
-        return Observation(view, np.nan_to_num(self.heights) > 0.01, goal, barred, may_push)
+        return Observation(view, segment(view).labels, goal, barred, may_push)
 
 
 def packed_goal():

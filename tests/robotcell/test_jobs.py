@@ -202,7 +202,7 @@ def test_an_interrupt_in_motion_leaves_a_standing_arm_and_a_latch(config: CellCo
         view = look(cell)
         guard = Guard(config)
         executor = Executor(cell, guard)
-        (action,) = (grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels > 0, None, (), True)),)
+        (action,) = (grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True)),)
         checked = check_plan(plan_action(action, view.heightmap, cell.arm.state().q, config), config)
         calls = 0
 
@@ -229,7 +229,7 @@ def test_an_interrupt_in_motion_leaves_a_standing_arm_and_a_latch(config: CellCo
 def test_a_held_object_that_the_camera_does_not_miss_is_unconfirmed(config: CellConfig) -> None:
     with open_cell(config) as cell:
         view = look(cell)
-        action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels > 0, None, (), True))
+        action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True))
         execution = Execution(Ending.DONE, "home", 0.0, 0.05)
         outcome = judge(Decision(1, "red", view, action), look(cell), execution)
     assert outcome.result is Result.UNCONFIRMED

@@ -8,13 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotcell import kinematics
+from robotcell import kinematics, linkage
 from robotcell.config import CellConfig
 from robotcell.decision import Primitive
 from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
 from robotcell.interfaces import ArmMode, ArmState
 from robotcell.primitives import (
-    T_FLANGE_TCP,
     Grip,
     JointMove,
     LinearMove,
@@ -40,7 +39,7 @@ def joint_move(q: Any, speed: float = 1.0, acceleration: float = 1.0, load_m: fl
 
 def above(x: float, y: float, z: float) -> JointMove:
     """A joint move to a tool-down pose."""
-    q = kinematics.inverse(tool_down(x, y, z, 0.0) @ np.linalg.inv(T_FLANGE_TCP), HOME)
+    q = kinematics.inverse(tool_down(x, y, z, 0.0) @ np.linalg.inv(linkage.T_FLANGE_TCP), HOME)
     assert q is not None
     return joint_move(q)
 
@@ -54,7 +53,7 @@ def state(**changes: Any) -> ArmState:
         t=0.0,
         q=HOME,
         qd=np.zeros(6),
-        T_base_tcp=kinematics.forward(HOME) @ T_FLANGE_TCP,
+        T_base_tcp=kinematics.forward(HOME) @ linkage.T_FLANGE_TCP,
         wrench=np.zeros(6),
         mode=ArmMode.READY,
     )
@@ -150,10 +149,10 @@ def test_a_line_through_the_wrist_singularity_is_refused() -> None:
     # With the fifth joint at zero the fourth and the sixth axis fall together.
     q = HOME.copy()
     q[4] = 0.3
-    T = kinematics.forward(q) @ T_FLANGE_TCP
+    T = kinematics.forward(q) @ linkage.T_FLANGE_TCP
     past = HOME.copy()
     past[4] = -0.3
-    T_past = kinematics.forward(past) @ T_FLANGE_TCP
+    T_past = kinematics.forward(past) @ linkage.T_FLANGE_TCP
     wide = {"x": (-1, 1), "y": (-1, 1), "z": (0, 1.2)}
     config = CellConfig.model_validate({"limits": wide})
     T_goal = T.copy()
@@ -164,7 +163,7 @@ def test_a_line_through_the_wrist_singularity_is_refused() -> None:
 
 def test_a_retreat_from_above_the_table_is_safe() -> None:
     step = above(-0.5, 0.1, 0.01)
-    low = state(q=step.q, T_base_tcp=kinematics.forward(step.q) @ T_FLANGE_TCP)
+    low = state(q=step.q, T_base_tcp=kinematics.forward(step.q) @ linkage.T_FLANGE_TCP)
     plan = plan_retreat(low, CONFIG)
     check_plan(plan, CONFIG)
     first = plan.steps[0]
