@@ -18,7 +18,6 @@ from robotcell.geometry import (
     check_transform,
     interpolate_transforms,
     invert_transform,
-    make_transform,
     rotation_angle,
 )
 from robotcell.interfaces import ArmMode, ArmState
@@ -50,8 +49,7 @@ _ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
 # Two neighbouring samples of a path that differ by more than this are different configurations of the arm.
 _BRANCH_STEP_RAD = 0.3
 
-T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, linkage.CLOSED_LENGTH_M))
-_T_TCP_FLANGE = invert_transform(T_FLANGE_TCP)
+_T_TCP_FLANGE = invert_transform(linkage.T_FLANGE_TCP)
 
 
 class TwinArm:
@@ -112,13 +110,13 @@ class TwinArm:
         """
         self._need_connection()
         q, qd = self._world.joint_states(self._joints)
-        contact = self._world.contact()
+        T_base_tcp = kinematics.forward(q) @ linkage.T_FLANGE_TCP
         return ArmState(
             t=self._world.time_s,
             q=q,
             qd=qd,
-            T_base_tcp=kinematics.forward(q) @ T_FLANGE_TCP,
-            wrench=np.concatenate([contact.tool_force, contact.tool_torque]),
+            T_base_tcp=T_base_tcp,
+            wrench=self._world.contact().tool_wrench(T_base_tcp[:3, 3]),
             mode=self._mode,
         )
 
@@ -163,7 +161,7 @@ class TwinArm:
         _check_range("speed", speed_m_s, kinematics.MAX_TOOL_SPEED, "m/s")
         _check_range("acceleration", acceleration_m_s2, kinematics.MAX_TOOL_ACCELERATION, "m/s^2")
         q = self._path[-1]
-        T_start = kinematics.forward(q) @ T_FLANGE_TCP
+        T_start = kinematics.forward(q) @ linkage.T_FLANGE_TCP
         turn = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
         distance = max(float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3])), turn * _ROTATION_LEVER_M)
         s = trapezoid(distance, speed_m_s, acceleration_m_s2, STEP_S)

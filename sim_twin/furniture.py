@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from robotcell.collision import obstacles
+from robotcell.collision import camera_post
 from robotcell.geometry import make_transform
 from sim_twin.robot_model import Part, Vector
 
@@ -27,8 +27,6 @@ _POST_M = 0.04
 # Intel RealSense D415 data sheet: 99 x 20 x 23 mm; the optical centre lies just behind the front glass.
 _D415_M = (0.099, 0.023, 0.020)
 _GLASS_M = 0.003
-# A camera that looks straighter down than this hangs from above: its post would stand in its view.
-_HANGING_SLOPE = 0.1
 
 
 def furniture(config: CellConfig) -> tuple[tuple[FurnitureKind, Part], ...]:
@@ -73,10 +71,10 @@ def _camera(config: CellConfig) -> list[Part]:
     T_base_camera = config.camera.pose()
     housing = T_base_camera @ make_transform(np.eye(3), (0.0, 0.0, -_GLASS_M - _D415_M[2] / 2))
     parts = [Part("box", _D415_M, housing, _CAMERA_COLOR)]
-    if np.linalg.norm(T_base_camera[:2, 2]) > _HANGING_SLOPE:
-        post = obstacles(config)[-1]
+    post = camera_post(config)
+    if post is not None:
         x, y, half = sum(post.x) / 2, sum(post.y) / 2, _POST_M / 2
-        parts.append(_block((x - half, y - half, config.table.height_m), (x + half, y + half, post.z[1]), _POST_COLOR))
+        parts.append(_block((x - half, y - half, post.z[0]), (x + half, y + half, post.z[1]), _POST_COLOR))
     return parts
 
 

@@ -6,6 +6,7 @@ sleeping for objects): docs/twin.md lists them with what they are good for.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,7 @@ _OBJECT_FRICTION = 0.8
 _FINGER_FRICTION = 1.0
 # Painted wood on a laminate table top, assumed; the engine multiplies the two bodies' coefficients.
 _TABLE_FRICTION = 0.6
+# Not only for what rolls: without it flat objects in a heap rock for ever and keep the whole heap awake.
 _ROLLING_FRICTION = 0.001
 _SPINNING_FRICTION = 0.002
 # Rubber finger tips and the compliance of the arm behind them: a contact force grows over millimetres, as on the
@@ -88,20 +90,31 @@ class Visual:
 
 @dataclass(frozen=True)
 class Contact:
-    """What the surroundings do to arm and gripper in the last step, base axes.
+    """Where the surroundings touched arm and gripper in the last step, base axes.
 
     Attributes:
-        tool_force: (3,) on the gripper [N].
-        tool_torque: (3,) on the gripper about the tcp [N m].
-        robot_force: (3,) on arm and gripper together [N].
+        forces: (N, 3) on arm or gripper [N].
+        places: (N, 3) [m].
+        on_tool: (N,) whether it is the gripper that is touched.
     """
 
-    tool_force: Array
-    tool_torque: Array
-    robot_force: Array
+    forces: Array
+    places: Array
+    on_tool: npt.NDArray[np.bool_]
+
+    @property
+    def robot_force(self) -> Array:
+        """(3,) sum of the forces on arm and gripper [N]."""
+        return np.asarray(self.forces.sum(axis=0))
+
+    def tool_wrench(self, point: Array) -> Array:
+        """(6,) force on the gripper [N] and its torque about a point (3,) [N m]."""
+        forces = self.forces[self.on_tool]
+        torques = np.cross(self.places[self.on_tool] - point, forces)
+        return np.concatenate([forces.sum(axis=0), torques.sum(axis=0)])
 
 
-_NO_CONTACT = Contact(np.zeros(3), np.zeros(3), np.zeros(3))
+_NO_CONTACT = Contact(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.bool_))
 
 
 @dataclass
@@ -113,6 +126,8 @@ class _Built:
     robot: int = -1
     joints: dict[str, int] = field(default_factory=dict)
     bodies: list[int] = field(default_factory=list)
+    # For how many slices in a row each body has been at rest.
+    quiet: list[int] = field(default_factory=list)
     scene_objects: tuple[SceneObject, ...] = ()
     visuals: tuple[Visual, ...] = ()
     # The frame that carries each visual: ("fixed", 0), ("link", index), ("second crank", side), ("object", index).
@@ -182,6 +197,8 @@ class World:
                 controller()
             step(client)
             self._steps += 1
+            if self._steps % _SETTLE_SLICE == 0:
+                self._let_sleep()
 
     def joint_index(self, names: Sequence[str]) -> list[int]:
         """The engine's numbers of joints, see `robot_model`."""
@@ -297,7 +314,9 @@ class World:
             table = self._load_furniture()
             # The scene comes to rest before the arm is there, so an object never falls onto it.
             self._load_scene(scene)
-            self._fall_asleep()
+            for body in self._built.bodies:
+                self._put_to_sleep(body)
+            self._built.quiet = [0] * len(self._built.bodies)
             self._load_robot(table)
             self._make_visuals()
         except BaseException:
@@ -462,20 +481,31 @@ class World:
         quiet = 0
         for _ in range(_SETTLE_SLICES):
             self._run(_SETTLE_SLICE)
-            speeds = [built.engine.getBaseVelocity(b, physicsClientId=built.client) for b in built.bodies]
-            resting = all(np.linalg.norm(v) < _REST_SPEED and np.linalg.norm(w) < _SLEEP_SPEED for v, w in speeds)
+            # What rolled out of the workspace may roll on, or fall off the table; it is dropped again.
+            resting = all(self._at_rest(body) for body in built.bodies if self._in_workspace(body))
             quiet = quiet + 1 if resting else 0
             if quiet == _QUIET_SLICES:
                 return
         raise ConfigError(f"scene {scene.name!r} does not come to rest: its objects overlap or keep rolling")
 
-    def _fall_asleep(self) -> None:
-        """Spare the engine the seconds in which objects that rest already would fall asleep by themselves."""
+    def _at_rest(self, body: int) -> bool:
         built = self._need()
-        for body in built.bodies:
-            built.engine.changeDynamics(
-                body, -1, activationState=built.engine.ACTIVATION_STATE_SLEEP, physicsClientId=built.client
-            )
+        v, w = built.engine.getBaseVelocity(body, physicsClientId=built.client)
+        return math.hypot(*v) < _REST_SPEED and math.hypot(*w) < _SLEEP_SPEED
+
+    def _let_sleep(self) -> None:
+        """Put to sleep what has rested for a while; the engine itself would step it for two more seconds."""
+        built = self._need()
+        for i, body in enumerate(built.bodies):
+            built.quiet[i] = built.quiet[i] + 1 if self._at_rest(body) else 0
+            # Again in every slice: of objects that touch, the engine lets all sleep or none.
+            if built.quiet[i] >= _QUIET_SLICES:
+                self._put_to_sleep(body)
+
+    def _put_to_sleep(self, body: int) -> None:
+        built = self._need()
+        sleep = built.engine.ACTIVATION_STATE_SLEEP
+        built.engine.changeDynamics(body, -1, activationState=sleep, physicsClientId=built.client)
 
     def _in_workspace(self, body: int) -> bool:
         x, y, z = self._object_pose(body)[:3, 3]
@@ -505,14 +535,14 @@ class World:
         points = built.engine.getContactPoints(bodyA=built.robot, physicsClientId=built.client)
         if not points:
             return _NO_CONTACT
-        forces = np.array(
-            [np.multiply(c[7], c[9]) + np.multiply(c[11], c[10]) + np.multiply(c[13], c[12]) for c in points]
+        # Normal force and two frictions of each contact, each a size and a direction that pushes the robot.
+        sizes = np.array([(c[9], c[10], c[12]) for c in points])
+        directions = np.array([(c[7], c[11], c[13]) for c in points])
+        return Contact(
+            forces=np.einsum("ni,nij->nj", sizes, directions),
+            places=np.array([c[5] for c in points]),
+            on_tool=np.array([c[3] >= built.joints["flange"] for c in points]),
         )
-        on_tool = np.array([c[3] >= built.joints["flange"] for c in points])
-        places = np.array([c[5] for c in points])
-        tcp = tcp_of(self.flange())
-        tool_forces = forces * on_tool[:, None]
-        return Contact(tool_forces.sum(axis=0), np.cross(places - tcp, tool_forces).sum(axis=0), forces.sum(axis=0))
 
     def _make_visuals(self) -> None:
         built = self._need()
@@ -534,11 +564,6 @@ class World:
             entries.append((visual, ("object", i)))
         built.visuals = tuple(visual for visual, _ in entries)
         built.carriers = tuple(carrier for _, carrier in entries)
-
-
-def tcp_of(T_base_flange: Array) -> Array:
-    """The tcp (3,) [m] of a flange pose."""
-    return np.asarray(T_base_flange[:3, 3] + linkage.CLOSED_LENGTH_M * T_base_flange[:3, 2])
 
 
 def _quaternion(T: Array) -> list[float]:

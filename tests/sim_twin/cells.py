@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell import kinematics
+from robotcell import kinematics, linkage
 from robotcell.cell import Cell, open_cell
 from robotcell.config import load_config
 from robotcell.geometry import Array, make_transform
 from sim_twin import scenes
-from sim_twin.arm import T_FLANGE_TCP, TwinArm
+from sim_twin.arm import TwinArm
 from sim_twin.gripper import TwinGripper
 from sim_twin.shapes import block
 
@@ -54,7 +54,7 @@ def tool_down(x: float, y: float, z: float, yaw: float = 0.0) -> Array:
 
 def joints_at(T_base_tcp: Array) -> Array:
     """Joint angles, elbow up, that put the tcp there."""
-    q = kinematics.inverse(T_base_tcp @ np.linalg.inv(T_FLANGE_TCP), _Q_NEAR)
+    q = kinematics.inverse(T_base_tcp @ np.linalg.inv(linkage.T_FLANGE_TCP), _Q_NEAR)
     assert q is not None
     return q
 

@@ -2,11 +2,10 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from robotcell import kinematics
+from robotcell import kinematics, linkage
 from robotcell.config import load_config
 from robotcell.errors import ConnectionLost
 from robotcell.geometry import transform_points
-from sim_twin.arm import T_FLANGE_TCP
 from tests.sim_twin.cells import finish, joints_at, open_twin, tool_down, with_block
 
 
@@ -123,7 +122,7 @@ def test_home_is_out_of_the_cameras_view_and_clear_of_everything():
                 outside = (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
                 assert outside.min() > 0.05
         assert world.contact().robot_force.tolist() == [0, 0, 0]
-        T_base_tcp = kinematics.forward(config.motion.home_q) @ T_FLANGE_TCP
+        T_base_tcp = kinematics.forward(config.motion.home_q) @ linkage.T_FLANGE_TCP
         assert T_base_tcp[2, 2] < -0.99999
         assert joints_at(tool_down(*config.bin.center, top + 0.25)) is not None
 
