@@ -50,13 +50,13 @@ _BODIES = (
     (0, (0.0, 0.0, 0.03), (0.0, 0.0, 0.1625), 0.075),
     (1, (0.0, 0.0, 0.0), (0.0, 0.0, _UPPER_ARM_OFFSET_M), 0.070),
     (2, (0.425, 0.0, _UPPER_ARM_OFFSET_M), (0.0, 0.0, _UPPER_ARM_OFFSET_M), 0.060),
+    (2, (0.0, 0.0, _UPPER_ARM_OFFSET_M), (0.0, 0.0, 0.0), 0.060),
     (3, (0.3922, 0.0, 0.015), (0.0, 0.0, 0.015), 0.055),
     (4, (0.0, -0.1333, 0.0), (0.0, 0.0, 0.0), 0.050),
     (5, (0.0, 0.0997, 0.0), (0.0, 0.0, 0.0), 0.048),
     (6, (0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 0.045),
     (6, (0.0, 0.0, 0.05), (0.0, 0.0, linkage.PALM_M), 0.055),
 )
-_GRIPPER = len(_BODIES) - 1
 # Bodies this many places apart in the chain share a joint housing or a neighbour's, and cannot touch.
 _NEIGHBOURS = 2
 
