@@ -28,9 +28,11 @@ LOAD_REACH_M = 0.060
 # Label of the first check for a held object; one that passes here and fails later was lost on the way.
 HELD_AFTER_LIFT = "held after the lift"
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
-_NEAR_M = 0.020
+_NEAR_M = 0.015
 # Finger tips pass this high over the walls of the bin with a load.
 _BIN_CLEARANCE_M = 0.12
+# Share of the bin's sides over which objects are let go; what is left is room for their own size.
+_RELEASE_SHARE = 0.5
 # A push shorter than this, after it was clamped to the workspace, moves nothing.
 _MIN_PUSH_M = 0.02
 
@@ -156,7 +158,7 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
     highest = table + _highest_under_gripper(heightmap, x, y)
     T_near[2, 3] = float(np.clip(highest + _NEAR_M - linkage.tip_retraction(use.preshape_m), tcp_z, approach_z))
     T_grasp[2, 3] = tcp_z
-    bin_x, bin_y = config.bin.center
+    bin_x, bin_y = _release_point(x, y, config)
     bin_z = table + config.bin.wall_height_m + _BIN_CLEARANCE_M
     q_bin = _solve("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
     steps: tuple[Step, ...] = (
@@ -179,6 +181,19 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
         _home(config),
     )
     return MotionPlan("grasp", q_start, steps)
+
+
+def _release_point(x: float, y: float, config: CellConfig) -> tuple[float, float]:
+    """Where (x, y) [m] over the bin a grasp at (x, y) lets go: the workspace shrunk onto the middle of the bin.
+
+    Objects that were spread over the table are then spread over the bin instead of heaped up at one point.
+    """
+    fractions = ((v - a) / (b - a) - 0.5 for v, (a, b) in ((x, config.workspace.x), (y, config.workspace.y)))
+    bin_x, bin_y = (
+        center + _RELEASE_SHARE * side * min(max(f, -0.5), 0.5)
+        for center, side, f in zip(config.bin.center, config.bin.size, fractions, strict=True)
+    )
+    return bin_x, bin_y
 
 
 def _plan_push(action: Action, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:

@@ -25,12 +25,11 @@ WIDTH_SPEED_M_S = 0.11
 _REACHED_M = 0.0002
 # Stopped short of the commanded width by more than this, the fingers hold something.
 GRIP_TOLERANCE_M = 0.001
-# Slower than this for that many steps, the fingers were stopped; faster than that for so many, they are free again.
-# What is held may creep or jerk a little in between.
-_STILL_M_S = 0.004
-_STILL_STEPS = 12
-_FREE_M_S = 0.03
-_FREE_STEPS = 16
+# Over so many steps, fingers that got less far than this were stopped; if further than that, they are free again.
+# In between, what is held creeps or gives way a little. Judged by the way, since gripped fingers tremble.
+_WINDOW_STEPS = 16
+_STILL_M = 0.0003
+_FREE_M = 0.002
 # The worm drive cannot be pushed back: at rest the cranks hold with this torque.
 _HOLDING_TORQUE_NM = 20.0
 # Share of the remaining way that the fingers may cover within a step, so that they do not overshoot.
@@ -47,8 +46,9 @@ class TwinGripper:
         self._target_m = 0.0
         self._force_n = 0.0
         self._driving = False
-        self._still_steps = 0
-        self._free_steps = 0
+        # Steps since the fingers were last judged, and where they were then.
+        self._judged_steps = 0
+        self._judged_width_m = 0.0
         self._stopped = False
 
     def __enter__(self) -> Self:
@@ -84,7 +84,7 @@ class TwinGripper:
         width = _width(self._world.joint_states(self._cranks)[0])
         return GripperState(
             t=self._world.time_s,
-            width_m=width,
+            width_m=max(width, linkage.MIN_WIDTH_M),
             busy=self._driving and not self._stopped,
             grip_detected=self._driving and self._stopped and abs(width - self._target_m) > GRIP_TOLERANCE_M,
         )
@@ -115,7 +115,7 @@ class TwinGripper:
         """One control period: drive the cranks towards the commanded width."""
         if not self._driving:
             return
-        angles, rates = self._world.joint_states(self._cranks)
+        angles, _ = self._world.joint_states(self._cranks)
         width, angle = _width(angles), float(angles.mean())
         way = self._target_m - width
         if abs(way) < _REACHED_M:
@@ -125,19 +125,23 @@ class TwinGripper:
         lever = linkage.CRANK_LENGTH_M * math.cos(angle)
         speed = math.copysign(min(WIDTH_SPEED_M_S, _APPROACH * abs(way) / STEP_S), way)
         self._world.drive_speeds(self._cranks, (speed / (2 * lever),) * 2, (self._force_n * lever,) * 2)
-        self._judge(abs(float(rates.sum())) * lever)
+        self._judge(width)
 
-    def _judge(self, speed: float) -> None:
+    def _judge(self, width_m: float) -> None:
         """Tell fingers that something stopped from fingers that move."""
-        self._still_steps = self._still_steps + 1 if speed < _STILL_M_S else 0
-        self._free_steps = self._free_steps + 1 if speed > _FREE_M_S else 0
-        if self._still_steps >= _STILL_STEPS:
+        self._judged_steps += 1
+        if self._judged_steps < _WINDOW_STEPS:
+            return
+        way = abs(width_m - self._judged_width_m)
+        if way < _STILL_M:
             self._stopped = True
-        elif self._free_steps >= _FREE_STEPS:
+        elif way > _FREE_M:
             self._stopped = False
+        self._judged_steps, self._judged_width_m = 0, width_m
 
     def _forget_motion(self) -> None:
-        self._still_steps = self._free_steps = 0
+        self._judged_steps = 0
+        self._judged_width_m = _width(self._world.joint_states(self._cranks)[0])
         self._stopped = False
 
     def _hold(self) -> None:

@@ -61,6 +61,7 @@ def run_json(*arguments: str | Path) -> dict[str, Any]:
         check=False,
     )
     assert completed.returncode in {0, 1}, completed.stderr
+    assert "pybullet" not in completed.stderr
     summary: dict[str, Any] = json.loads(completed.stdout)
     return summary
 

@@ -4,6 +4,7 @@ import pytest
 from robotcell import linkage
 from robotcell.geometry import invert_transform, transform_points
 from sim_twin import robot_model
+from sim_twin.gripper import TwinGripper
 from tests.sim_twin.cells import close_on, finish, go, joints_at, open_twin, tool_down, with_block
 
 
@@ -83,6 +84,49 @@ def test_a_grip_that_loses_its_object_is_no_longer_one(monkeypatch):
         assert not state.grip_detected
         assert not state.busy
         assert state.width_m < 0.001
+
+
+class TremblingWorld:
+    """Fingers that are stopped at 48 mm and tremble there by a quarter of a millimetre in every step."""
+
+    time_s = 0.0
+
+    def __init__(self):
+        self.controllers = []
+        self.steps = 0
+
+    def attach(self, device): ...
+
+    def detach(self, device): ...
+
+    def add_controller(self, controller):
+        self.controllers.append(controller)
+
+    def remove_controller(self, controller):
+        self.controllers.remove(controller)
+
+    def joint_index(self, names):
+        return [0, 1]
+
+    def joint_states(self, joints):
+        width = 0.048 + 0.00012 * (-1) ** self.steps
+        return np.full(2, linkage.crank_angle(width)), np.full(2, 0.5 * (-1) ** self.steps)
+
+    def drive_positions(self, *arguments): ...
+
+    def drive_speeds(self, *arguments): ...
+
+
+def test_fingers_that_tremble_on_what_they_grip_are_not_busy():
+    world = TremblingWorld()
+    with TwinGripper(world) as gripper:
+        gripper.start_width(0.0, 40.0)
+        for _ in range(60):
+            world.steps += 1
+            for control in world.controllers:
+                control()
+        assert not gripper.state().busy
+        assert gripper.state().grip_detected
 
 
 @pytest.mark.parametrize("name", ["cube", "plank", "half_round_slab", "arch", "cylinder"])
