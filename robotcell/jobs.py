@@ -25,8 +25,6 @@ from robotcell.safety import Guard, check_plan
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import numpy.typing as npt
-
     from robotcell.cell import Cell
     from robotcell.interfaces import RgbdFrame
     from robotcell.primitives import MotionPlan
@@ -405,24 +403,25 @@ def _observe(view: View, goal: str | None, barred: tuple[Action, ...], *, may_pu
 def _taken(decision: Decision, after: View) -> Instance | None:
     """The object that left the table: the one that the action was aimed at, or else the nearest that is gone."""
     before, action = decision.view, decision.action
-    sunk = _sunk(before.heightmap, after.heightmap)
-    known = np.isfinite(before.heightmap.height_m) & np.isfinite(after.heightmap.height_m)
     aimed_at = before.segmentation.labels[action.row, action.col]
     gone: list[tuple[bool, float, Instance]] = []
     for instance in before.segmentation.instances:
-        cells = (before.segmentation.labels == instance.label) & known
-        if not cells.any() or (sunk & cells).sum() < _GONE_SHARE * cells.sum():
-            continue
         x, y = instance.centroid
         distance = float(np.hypot(x - action.xyz[0], y - action.xyz[1]))
-        if instance.label == aimed_at or distance < _REACH_M:
+        near = instance.label == aimed_at or distance < _REACH_M
+        if near and _is_gone(instance, before, after):
             gone.append((instance.label != aimed_at, distance, instance))
     return min(gone, key=lambda entry: entry[:2])[2] if gone else None
 
 
-def _sunk(before: Heightmap, after: Heightmap) -> npt.NDArray[np.bool_]:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(before.height_m - after.height_m > _CHANGED_M)
+def _is_gone(instance: Instance, before: View, after: View) -> bool:
+    """Whether the place where an object was is lower than before, or shows another one that fell into it."""
+    known = np.isfinite(before.heightmap.height_m) & np.isfinite(after.heightmap.height_m)
+    place = before.segmentation.mask(instance) & known
+    sunk = before.heightmap.height_m[place] - after.heightmap.height_m[place] > _CHANGED_M
+    same_color = [other.label for other in after.segmentation.instances if other.color_name == instance.color_name]
+    replaced = ~np.isin(after.segmentation.labels[place], [0, *same_color])
+    return bool(place.any() and (sunk | replaced).mean() >= _GONE_SHARE)
 
 
 def _changed(before: Heightmap, after: Heightmap) -> int:

@@ -44,7 +44,8 @@ def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
     """Check every step of a plan against every limit, from the joint angles it starts at.
 
     Reach, joint limits, singularities on straight lines, speeds, the box of the tcp, keep-outs, the table, the arm
-    itself and the gripper's range; with the load where one is held.
+    itself and the gripper's range; with the load where one is held. Where the arm stands at the start is a fact, not a
+    plan: only where it goes is checked, so that it can leave a place that it should not be in.
 
     Raises:
         UnsafeMotion: the first violation, with the step, the place and the limit.
@@ -67,11 +68,11 @@ def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
             )
             count = int(np.ceil(np.abs(goal - q).max() / _JOINT_STEP_RAD)) + 1
             path = q + np.linspace(0.0, 1.0, max(count, 2))[:, None] * (goal - q)
-            _check_path(path, step.load_m, obstacles, config, name)
+            _check_path(path[1:], step.load_m, obstacles, config, name)
             q = goal
         elif isinstance(step, LinearMove):
             path = _linear_path(q, step, config, name)
-            _check_path(path, step.load_m, obstacles, config, name)
+            _check_path(path[1:], step.load_m, obstacles, config, name)
             q = path[-1]
         elif not isinstance(step, CheckHold):
             raise TypeError(f"{name}: {type(step).__name__} is no step of a plan")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +16,7 @@ from robotcell.errors import CalibrationError, DeviceFault, GuardTripped, NoTarg
 from robotcell.executor import Ending, Execution, Executor
 from robotcell.jobs import Decision, Outcome, Report, Result, View, judge, look, run_job
 from robotcell.journal import Journal
+from robotcell.perception import find_goal
 from robotcell.safety import Guard, check_plan
 
 if TYPE_CHECKING:
@@ -224,6 +225,28 @@ def test_an_interrupt_in_motion_leaves_a_standing_arm_and_a_latch(config: CellCo
             executor.run(checked)
         executor.recover()
         assert guard.violation is None
+
+
+def test_an_object_is_missed_even_when_another_fell_into_its_place(config: CellConfig) -> None:
+    with open_cell(config) as cell:
+        view = look(cell)
+        action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True))
+        # The blue cube now stands where the red one stood.
+        shift = round((RED[1] - BLUE[1]) / config.workspace.resolution_m)
+        after = replace(
+            view,
+            heightmap=replace(view.heightmap, height_m=np.roll(view.heightmap.height_m, shift, axis=0)),
+            segmentation=replace(
+                view.segmentation,
+                labels=np.where(
+                    np.roll(view.segmentation.labels, shift, axis=0) == find_goal(view.segmentation, "blue").label,
+                    find_goal(view.segmentation, "blue").label,
+                    0,
+                ).astype(np.int32),
+            ),
+        )
+        outcome = judge(Decision(1, "red", view, action), after, Execution(Ending.DONE, "home", 0.0, 0.05))
+    assert outcome.result is Result.PICKED
 
 
 def test_a_held_object_that_the_camera_does_not_miss_is_unconfirmed(config: CellConfig) -> None:

@@ -171,6 +171,15 @@ def test_a_retreat_from_above_the_table_is_safe() -> None:
     assert first.T_base_tcp[2, 3] > 0.15
 
 
+def test_a_retreat_from_too_low_is_safe_and_a_move_along_there_is_not() -> None:
+    # Two millimetres above the table, one below the clearance of the tips.
+    step = above(-0.5, 0.1, 0.002)
+    low = state(q=step.q, T_base_tcp=kinematics.forward(step.q) @ linkage.T_FLANGE_TCP)
+    check_plan(plan_retreat(low, CONFIG), CONFIG)
+    with pytest.raises(UnsafeMotion, match="finger tips"):
+        check_plan(MotionPlan("test", step.q, (to(-0.5, 0.0, 0.002),)), CONFIG)
+
+
 def test_a_plan_starts_where_the_arm_stands() -> None:
     guard = Guard(CONFIG)
     guard.check_start(state(), plan_of())
