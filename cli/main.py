@@ -1,16 +1,20 @@
 """The `robotcell` command.
 
 Exit codes: 0 complete, 1 not complete, 2 wrong usage or configuration, 3 a device or the safety layer stopped the
-cell, 130 interrupted.
+cell, 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
 
+import signal
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 # Everything heavy is imported inside the commands, so that --help answers at once.
 
@@ -93,8 +97,14 @@ def show(job: Annotated[int, typer.Argument(help="The job's number.")], cell: Ce
     raise typer.Exit(show_job(cell, job))
 
 
+def _end(number: int, _frame: FrameType | None) -> NoReturn:
+    sys.exit(128 + number)
+
+
 def main() -> None:
     """Entry point of the console script."""
+    # As an interrupt does: the arm is stopped and the journal closed before the process ends.
+    signal.signal(signal.SIGTERM, _end)
     try:
         app()
     except KeyboardInterrupt:

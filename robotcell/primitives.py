@@ -29,7 +29,9 @@ LOAD_REACH_M = 0.060
 HELD_AFTER_LIFT = "held after the lift"
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
 _NEAR_M = 0.015
-# Finger tips pass this high over the walls of the bin with a load.
+# A load is lifted until it would pass this high over the walls of the bin.
+_CARRY_CLEARANCE_M = 0.03
+# The finger tips are this high over the walls of the bin when they let go.
 _BIN_CLEARANCE_M = 0.12
 # Share of the bin's sides over which objects are let go; what is left is room for their own size.
 _RELEASE_SHARE = 0.5
@@ -154,7 +156,8 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
     q_above = _solve("approach", tool_down(x, y, approach_z, theta), config)
     # The symmetric jaw may have been turned by half a turn to stay near the home pose.
     T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
-    T_near, T_grasp = T_above.copy(), T_above.copy()
+    T_near, T_grasp, T_lifted = (T_above.copy() for _ in range(3))
+    T_lifted[2, 3] = max(approach_z, table + config.bin.wall_height_m + LOAD_REACH_M + _CARRY_CLEARANCE_M)
     highest = table + _highest_under_gripper(heightmap, x, y)
     T_near[2, 3] = float(np.clip(highest + _NEAR_M - linkage.tip_retraction(use.preshape_m), tcp_z, approach_z))
     T_grasp[2, 3] = tcp_z
@@ -173,7 +176,7 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
             contact_force_n=motion.contact_force_n,
         ),
         Grip("close", linkage.MIN_WIDTH_M, use.force_n),
-        LinearMove("lift", T_above, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
+        LinearMove("lift", T_lifted, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
         CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
         _joint("carry to bin", q_bin, config, load_m=LOAD_REACH_M),
         CheckHold("held over the bin", use.empty_width_m),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -90,6 +91,19 @@ def test_the_same_seed_gives_the_same_job_to_the_last_action(tmp_path: Path) -> 
         return summary["simulated_s"], summary["picked_objects"], table[: table.index(table[-1])]
 
     assert once("first") == once("second")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_job_that_is_cut_off_is_on_record_as_stopped(cell: Path, number: signal.Signals, code: int) -> None:
+    command = [sys.executable, "-c", "from cli.main import main; main()", "pick", "--all", "--cell", str(cell)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+        assert process.stderr is not None
+        # The first line comes when the job has started.
+        assert process.stderr.readline().startswith("job 1")
+        process.send_signal(number)
+        process.stderr.read()
+        assert process.wait() == code
+    assert "stopped" in run("jobs", "show", "1", "--cell", cell).stdout
 
 
 def test_a_dry_run_draws_and_moves_nothing(cell: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from robotcell import kinematics, linkage
 from robotcell.config import CellConfig
 from robotcell.decision import Primitive
 from robotcell.errors import UnsafeMotion
-from robotcell.primitives import Grip, JointMove, LinearMove, MotionPlan, plan_action
+from robotcell.primitives import LOAD_REACH_M, Grip, JointMove, LinearMove, MotionPlan, plan_action
 from tests.robotcell.maps import action, heightmap
 
 CONFIG = CellConfig()
@@ -40,10 +40,12 @@ def test_a_grasp_closes_below_the_surface_and_above_the_table(x: float, y: float
 
 
 @given(xs, ys, surfaces, rotations)
-def test_a_grasp_lifts_straight_up_by_the_approach_height(x: float, y: float, z: float, rotation: int) -> None:
+def test_a_grasp_lifts_straight_up_until_the_load_clears_the_bin(x: float, y: float, z: float, rotation: int) -> None:
     plan = plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG)
     down, up = linear(plan, "descend guarded").T_base_tcp, linear(plan, "lift").T_base_tcp
-    np.testing.assert_allclose(up[:3, 3] - down[:3, 3], (0, 0, CONFIG.motion.approach_m), atol=1e-6)
+    np.testing.assert_allclose(up[:2, 3], down[:2, 3], atol=1e-6)
+    assert up[2, 3] >= down[2, 3] + CONFIG.motion.approach_m - 1e-6
+    assert up[2, 3] - LOAD_REACH_M > CONFIG.bin.wall_height_m
 
 
 def test_the_unguarded_descent_ends_above_what_stands_there() -> None:

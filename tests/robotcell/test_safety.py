@@ -79,6 +79,14 @@ def test_every_action_in_the_workspace_has_a_safe_plan(
     assert check_plan(plan, CONFIG).plan is plan
 
 
+@pytest.mark.parametrize("x", [*CONFIG.workspace.x, -0.5])
+@pytest.mark.parametrize("y", [*CONFIG.workspace.y, 0.0])
+@pytest.mark.parametrize("z", [0.0, 0.03, 0.1])
+def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z: float) -> None:
+    for rotation in range(16):
+        check_plan(plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG), CONFIG)
+
+
 @pytest.mark.parametrize(
     ("step", "reason"),
     [
