@@ -127,11 +127,15 @@ class Device(Protocol):
         """Release the device and stop what it does. Idempotent, safe at any time, never raises."""
         ...
 
-    def __enter__(self) -> Self: ...
+    def __enter__(self) -> Self:
+        """Connect. A class that names its Protocol as its base inherits this."""
+        self.connect()
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        self.close()
 
 
 class Arm(Device, Protocol):

@@ -20,16 +20,12 @@ from robotcell.geometry import (
     invert_transform,
     rotation_angle,
 )
-from robotcell.interfaces import ArmMode, ArmState
+from robotcell.interfaces import Arm, ArmMode, ArmState
 from sim_twin import robot_model
 from sim_twin.trajectory import slow_down, trapezoid
 from sim_twin.world import STEP_S
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
-    from typing_extensions import Self
-
     from sim_twin.world import World
 
 # A stop brakes the tool at 10 m/s^2 (what ur_rtde passes to stopl), here 0.5 m from the joint that turns fastest.
@@ -52,7 +48,7 @@ _BRANCH_STEP_RAD = 0.3
 _T_TCP_FLANGE = invert_transform(linkage.T_FLANGE_TCP)
 
 
-class TwinArm:
+class TwinArm(Arm):
     """The `Arm` of a world."""
 
     def __init__(self, world: World) -> None:
@@ -66,15 +62,6 @@ class TwinArm:
         self._braking = False
         self._force_limit_n = PROTECTIVE_FORCE_N
         self._kicked_at: float | None = None
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def connect(self) -> None:
         """Attach to the world and hold the arm where it is. Does nothing when connected."""

@@ -9,16 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from robotcell.errors import ConnectionLost
-from robotcell.interfaces import Intrinsics, RgbdFrame
+from robotcell.interfaces import Camera, Intrinsics, RgbdFrame
 from sim_twin.noise import WARM_UP_FRAMES, NoiseOptions, degrade_color, degrade_depth
 from sim_twin.raycast import Hits, Indices, RayCaster, load_open3d, ray_directions
 from sim_twin.world import STEP_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from types import TracebackType
-
-    from typing_extensions import Self
 
     from robotcell.config import CameraMount
     from sim_twin.world import Visual, World
@@ -42,7 +39,7 @@ _LIGHT = np.array([0.15, -0.25, 0.95]) / np.linalg.norm([0.15, -0.25, 0.95])
 _AMBIENT = 0.5
 
 
-class TwinCamera:
+class TwinCamera(Camera):
     """A `Camera` that looks at a simulated world with the resolution, rate and errors of a D415.
 
     Frames come at 30 Hz of simulated time: `read()` lets the world run on by one frame. `connect()` lets the
@@ -95,15 +92,6 @@ class TwinCamera:
             self._first_frame = None
             self._world.detach(self)
         self._caster = None
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def read(self) -> RgbdFrame:
         """The next frame.

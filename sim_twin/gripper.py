@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING
 
 from robotcell import linkage
 from robotcell.errors import ConnectionLost, UnsafeMotion
-from robotcell.interfaces import GripperState
+from robotcell.interfaces import Gripper, GripperState
 from sim_twin import robot_model
 from sim_twin.world import STEP_S
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
-    from typing_extensions import Self
-
     from robotcell.geometry import Array
     from sim_twin.world import World
 
@@ -36,7 +32,7 @@ _HOLDING_TORQUE_NM = 20.0
 _APPROACH = 0.3
 
 
-class TwinGripper:
+class TwinGripper(Gripper):
     """The `Gripper` of a world."""
 
     def __init__(self, world: World) -> None:
@@ -50,15 +46,6 @@ class TwinGripper:
         self._judged_steps = 0
         self._judged_width_m = 0.0
         self._stopped = False
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def connect(self) -> None:
         """Attach to the world and hold the fingers where they are. Does nothing when connected."""
