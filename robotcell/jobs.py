@@ -180,13 +180,13 @@ def run_job(
         DeviceFault, ConnectionLost, GuardTripped, CalibrationError: the cell was stopped. The journal has it.
     """
     run_dir = _make_run_dir(cell.config.journal.runs, goals)
-    job_id = journal.start_job(goals, policy.name, cell.config.model_dump(mode="json"), run_dir)
-    for observer in observers:
-        observer.started(job_id, run_dir)
     started = cell.clock.now()
-    job = _Job(cell, policy, journal, observers, job_id, run_dir)
     status, reason = "stopped", ""
+    job_id = journal.start_job(goals, policy.name, cell.config.model_dump(mode="json"), run_dir)
     try:
+        for observer in observers:
+            observer.started(job_id, run_dir)
+        job = _Job(cell, policy, journal, observers, job_id, run_dir)
         reason = job.pick_in_order(goals) if goals else job.pick_all()
         status = "incomplete" if reason else "complete"
     except NoTarget as error:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from robotcell import collision, kinematics, linkage
 from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
@@ -255,7 +256,7 @@ def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], conf
         raise UnsafeMotion(f"{name}: the arm or the gripper would touch the arm itself")
 
 
-def _outside_box(points: Array, config: CellConfig, slack_m: float) -> np.ndarray:
+def _outside_box(points: Array, config: CellConfig, slack_m: float) -> npt.NDArray[np.bool_]:
     limits = config.limits
     low, high = np.array([limits.x, limits.y, limits.z]).T
     return np.asarray(((points < low - slack_m) | (points > high + slack_m)).any(axis=1))

@@ -57,7 +57,7 @@ class TwinArm(Arm):
         self._joints: list[int] = []
         self._mode = ArmMode.READY
         # The motion under way: (N, 6) joint angles, one per step, and the sample that was commanded last.
-        self._path = np.empty((0, 6))
+        self._path: Array = np.empty((0, 6))
         self._index = 0
         self._braking = False
         self._force_limit_n = PROTECTIVE_FORCE_N

@@ -84,8 +84,8 @@ def drop_scene(name: str, shapes: Sequence[Shape], rng: np.random.Generator) -> 
     Each object starts as low as the ones before it leave room, so that nothing starts inside another, whether
     they are let go one after the other or all at once.
     """
-    centres = np.zeros((0, 3))
-    radii = np.zeros(0)
+    centres: Array = np.zeros((0, 3))
+    radii: Array = np.zeros(0)
     objects = []
     for i, (shape, color) in enumerate(zip(shapes, _colors(len(shapes), rng), strict=True)):
         radius = float(np.linalg.norm(shape.mesh.vertices, axis=1).max())

@@ -419,7 +419,8 @@ class World:
                 return
             for body in lost:
                 x, y = (rng.uniform(0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b) for a, b in self._workspace_sides())
-                turn = Rotation.random(random_state=int(rng.integers(2**31))).as_quat()
+                # A normalised quaternion of normal numbers is a uniform rotation.
+                turn = Rotation.from_quat(rng.normal(size=4)).as_quat()
                 z = self.config.table.height_m + 0.15
                 p.resetBasePositionAndOrientation(body, [x, y, z], turn.tolist(), physicsClientId=client)
                 p.resetBaseVelocity(body, [0, 0, 0], [0, 0, 0], physicsClientId=client)
