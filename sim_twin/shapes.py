@@ -26,6 +26,8 @@ __all__ = ["BLOCK_NAMES", "Mesh", "Shape", "block", "load_shape", "shape_of"]
 # Light wood, as in the physics measurements that the twin's settings come from.
 DEFAULT_DENSITY_KG_M3 = 400.0
 _CIRCLE_SEGMENTS = 32
+# The longest side of what could stand on the table.
+_EXTENT_M = (0.005, 0.5)
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,19 @@ def load_shape(path: Path) -> Shape:
     """The solid of an OBJ file [m]; concave objects in it collide in convex pieces.
 
     Raises:
-        ConfigError: the file is missing or malformed.
+        ConfigError: the file is missing or malformed, or of a size that speaks for another unit.
     """
-    return shape_of(path.stem, load_obj(path))
+    meshes = load_obj(path)
+    extent = float(np.ptp(join(meshes).vertices, axis=0).max())
+    if not _EXTENT_M[0] <= extent <= _EXTENT_M[1]:
+        raise ConfigError(
+            f"{path}: extent {extent:.3g} m; OBJ files are read in metres, and a mesh must measure "
+            f"{_EXTENT_M[0]} to {_EXTENT_M[1]} m"
+        )
+    try:
+        return shape_of(path.stem, meshes)
+    except ValueError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def shape_of(name: str, meshes: tuple[Mesh, ...]) -> Shape:
