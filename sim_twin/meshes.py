@@ -408,12 +408,13 @@ def _triangles(corners: list[int], vertices: list[tuple[float, ...]]) -> list[tu
 
 
 def _is_ear(outline: Array, i: int) -> bool:
-    """Whether the triangle at corner i of an outline (N, 2) lies in it, and no other corner lies in the triangle."""
+    """Whether the triangle at corner i of an outline (N, 2) lies in it, and no other corner in or on the triangle."""
     a, b, c = (outline[k % len(outline)] for k in (i - 1, i, i + 1))
-    others = np.delete(outline, [(i - 1) % len(outline), i, (i + 1) % len(outline)], axis=0)
-    sides = np.array([_turn(a, b, others), _turn(b, c, others), _turn(c, a, others)])
+    sides = np.array([_turn(a, b, outline), _turn(b, c, outline), _turn(c, a, outline)])
     slack = _COLLINEAR * np.ptp(outline, axis=0).prod()
-    return bool(_turn(a, b, c) >= -slack and not (sides > slack).all(axis=0).any())
+    # Outlines of faces with holes pass some corners twice.
+    others = ~(outline[:, None] == (a, b, c)).all(axis=2).any(axis=1)
+    return bool(_turn(a, b, c) >= -slack and not (others & (sides >= -slack).all(axis=0)).any())
 
 
 def _turn(a: Array, b: Array, c: Array) -> Array:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import cycle, permutations
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path, PureWindowsPath
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -21,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from robotcell.errors import ConfigError
 from robotcell.geometry import make_transform, rotation_z, rotvec_to_matrix
 from robotcell.palette import PALETTE
-from sim_twin.meshes import Mesh, bounds_center, mesh_inertia
+from sim_twin.meshes import Mesh, bounds_center, mesh_inertia, parse_number
 from sim_twin.scene import Scene, SceneObject
 from sim_twin.shapes import BLOCK_NAMES, Shape, block, load_shape
 
@@ -55,13 +57,10 @@ def read_scene(path: Path, meshes: Path | None) -> Scene:
     Raises:
         ConfigError: the file or a mesh is missing or malformed; the message names file, line or key, and reason.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such scene file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text: {error}") from error
-    if path.suffix == ".toml":
+    if meshes is not None and not meshes.is_dir():
+        raise ConfigError(f"{meshes}: no such folder; --meshes names that of the OBJ files")
+    text = _text(path)
+    if path.suffix.lower() == ".toml":
         return _read_toml(path, text, meshes)
     return _read_rows(path, text, meshes)
 
@@ -92,11 +91,34 @@ def mesh_frame(mesh: Mesh) -> Array:
     return np.column_stack([x, y, np.cross(x, y)])
 
 
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such scene file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as text: {error}") from error
+
+
+def _toml(path: Path, text: str) -> dict[str, Any]:
+    try:
+        table: dict[str, Any] = tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(f"{path}: not a TOML file: it is nested too deeply") from None
+    except ValueError as error:  # of the syntax, or of an integer of thousands of digits
+        raise ConfigError(f"{path}: not a TOML file: {error}") from None
+    return table
+
+
 class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-Vector = tuple[float, float, float]
+# Far beyond any table, and small enough to calculate with.
+_LARGEST = 1000.0
+
+Number = Annotated[float, Field(strict=True, ge=-_LARGEST, le=_LARGEST)]
+Vector = tuple[Number, Number, Number]
 Channel = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -126,8 +148,8 @@ class _SceneTable(_Strict):
 
     name: Annotated[str, Field(min_length=1)]
     drop: bool = False
-    center: tuple[float, float] = (0.0, 0.0)
-    yaw: float = 0.0
+    center: tuple[Number, Number] = (0.0, 0.0)
+    yaw: Number = 0.0
     object: Annotated[tuple[_ObjectTable, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
@@ -140,16 +162,15 @@ class _SceneTable(_Strict):
 
 def _read_toml(path: Path, text: str, meshes: Path | None) -> Scene:
     try:
-        table = _SceneTable.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from None
+        table = _SceneTable.model_validate(_toml(path, text))
     except ValidationError as error:
         problems = [_describe(detail["loc"], detail["msg"]) for detail in error.errors()]
         raise ConfigError("\n  ".join([f"{path}: {len(problems)} mistake(s)", *problems])) from None
     T_scene_group = make_transform(rotation_z(table.yaw), (*table.center, 0.0))
     objects = []
+    load = cache(load_shape)
     for item in table.object:
-        shape = block(item.shape) if item.shape else load_shape(_toml_mesh(path, item, meshes))
+        shape = block(item.shape) if item.shape else load(_toml_mesh(path, item, meshes))
         R = rotvec_to_matrix(item.rotation)
         T = T_scene_group @ _centred_at(item.position, R, shape)
         color = PALETTE[item.color] if isinstance(item.color, str) else item.color
@@ -167,10 +188,13 @@ def _describe(place: tuple[int | str, ...], message: str) -> str:
 def _toml_mesh(path: Path, item: _ObjectTable, meshes: Path | None) -> Path:
     folders = [path.parent, *([meshes] if meshes else [])]
     for folder in folders:
-        if (folder / str(item.mesh)).is_file():
-            return folder / str(item.mesh)
+        with suppress(OSError, ValueError):  # of a name that no file can have
+            if (folder / str(item.mesh)).is_file():
+                return folder / str(item.mesh)
     places = " or ".join(str(folder) for folder in folders)
-    raise ConfigError(f"{path}: object {item.name!r}: no mesh {item.mesh!r} in {places}; name its folder with --meshes")
+    raise ConfigError(
+        f"{path}: object {item.name!r}: no mesh {str(item.mesh)[:80]!r} in {places}; name its folder with --meshes"
+    )
 
 
 def _centred_at(position: tuple[float, ...] | Array, R: Array, shape: Shape) -> Array:
@@ -191,6 +215,7 @@ class _Row:
 
 def _read_rows(path: Path, text: str, meshes: Path | None) -> Scene:
     lines = [(n, fields) for n, line in enumerate(text.splitlines(), start=1) if (fields := line.split())]
+    lines = [(number, fields) for number, fields in lines if not fields[0].startswith("#")]
     if not lines:
         raise ConfigError(f"{path}: holds no objects; see docs/scenes.md for the formats")
     widths = {10: _vpg_row, 8: _named_row}
@@ -232,9 +257,10 @@ def _named_row(number: int, fields: list[str]) -> _Row:
 
 
 def _row(number: int, mesh: str, color: str | tuple[int, int, int] | None, fields: list[str]) -> _Row:
-    name = PurePosixPath(mesh).name
-    if not name.endswith(".obj"):
-        raise ValueError(f"{mesh!r} is not the name of an OBJ file")
+    # Published files use either slash.
+    name = PureWindowsPath(mesh).name
+    if not name.lower().endswith(".obj"):
+        raise ValueError(f"{mesh[:80]!r} is not the name of an OBJ file")
     numbers = _numbers(fields, ("x", "y", "z", "alpha", "beta", "gamma"))
     return _Row(number, name, color, numbers[:3], numbers[3:])
 
@@ -243,12 +269,11 @@ def _numbers(fields: list[str], names: tuple[str, ...]) -> Array:
     values = []
     for field, name in zip(fields, names, strict=True):
         try:
-            value = float(field)
-        except ValueError:
-            raise ValueError(f"{name} is {field!r}, which is no number") from None
-        if not np.isfinite(value):
-            raise ValueError(f"{name} is {field!r}; it must be finite")
-        values.append(value)
+            values.append(parse_number(field))
+        except ValueError as error:
+            raise ValueError(f"{name} is {error}") from None
+        if abs(values[-1]) > _LARGEST:
+            raise ValueError(f"{name} is {field[:40]!r}; it must lie within {_LARGEST:.0f}")
     return np.array(values)
 
 
@@ -258,16 +283,22 @@ def _parked(row: _Row) -> bool:
 
 
 def _row_objects(path: Path, rows: list[_Row], meshes: Path) -> tuple[SceneObject, ...]:
-    shapes: dict[str, tuple[Shape, Array]] = {}
-    frames = _read_frames(meshes)
+    files = sorted(file for file in meshes.iterdir() if file.is_file())
+    # Published files name meshes in either case.
+    by_name = {file.name.lower(): file for file in files} | {file.name: file for file in files}
+    shapes: dict[Path, tuple[Shape, Array]] = {}
+    frames = _read_frames(meshes, {file.name for file in files})
     goals = {row.color for row in rows}
     obstacle_colors = cycle([name for name in PALETTE if name not in goals] or list(PALETTE))
     objects = []
     for row in rows:
-        if row.mesh not in shapes:
-            shape = load_shape(_row_mesh(path, row, meshes))
-            shapes[row.mesh] = shape, frames.get(row.mesh, mesh_frame(shape.mesh))
-        shape, R_mesh_frame = shapes[row.mesh]
+        mesh = by_name.get(row.mesh) or by_name.get(row.mesh.lower())
+        if mesh is None:
+            raise ConfigError(f"{path}, line {row.number}: there is no {row.mesh[:80]} in {meshes}; see --meshes")
+        if mesh not in shapes:
+            shape = load_shape(mesh)
+            shapes[mesh] = shape, frames.get(mesh.name, mesh_frame(shape.mesh))
+        shape, R_mesh_frame = shapes[mesh]
         R_base_frame = Rotation.from_euler("XYZ", row.angles).as_matrix()
         # The bounding box lies along the frame's axes, which need not be those of the mesh.
         in_frame = Mesh(shape.mesh.vertices @ R_mesh_frame, shape.mesh.triangles)
@@ -280,12 +311,6 @@ def _row_objects(path: Path, rows: list[_Row], meshes: Path) -> tuple[SceneObjec
     return tuple(objects)
 
 
-def _row_mesh(path: Path, row: _Row, meshes: Path) -> Path:
-    if not (meshes / row.mesh).is_file():
-        raise ConfigError(f"{path}, line {row.number}: there is no {row.mesh} in {meshes}; see --meshes")
-    return meshes / row.mesh
-
-
 class _FrameTable(_Strict):
     """A mesh in frames.toml: which mesh axis the frame's x and y axes are."""
 
@@ -293,17 +318,15 @@ class _FrameTable(_Strict):
     y: Vector
 
 
-def _read_frames(meshes: Path) -> dict[str, Array]:
+def _read_frames(meshes: Path, files: set[str]) -> dict[str, Array]:
     """Rotations (3, 3) from frame to mesh axes, by the name of the mesh file."""
     path = meshes / FRAMES_FILE
-    if not path.is_file():
+    if FRAMES_FILE not in files:
         return {}
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from None
     frames = {}
-    for name, table in tables.items():
+    for name, table in _toml(path, _text(path)).items():
+        if name not in files:
+            raise ConfigError(f"{path}: there is no mesh {name[:80]!r} beside it")
         try:
             frame = _FrameTable.model_validate(table)
         except ValidationError as error:

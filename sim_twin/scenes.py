@@ -61,6 +61,8 @@ def make_scene(
     """
     if count < 1:
         raise ConfigError(f"a scene needs at least one object; {count} were asked for")
+    if meshes is not None and name in scene_names():
+        raise ConfigError(f"scene {name!r} has its own meshes; --meshes {meshes} belongs to a scene file")
     rng = np.random.default_rng(seed)
     if name == "random":
         shapes = [block(BLOCK_NAMES[i]) for i in rng.integers(len(BLOCK_NAMES), size=count)]
@@ -69,11 +71,12 @@ def make_scene(
         scene = drop_scene(name, novel_shapes(count, rng), rng)
     elif name in scene_names():
         scene = read_scene(_BUILT_IN / f"{name}.toml", None)
-    elif Path(name).is_file():
+    elif _is_file(Path(name)):
         scene = read_scene(Path(name), meshes)
     else:
         raise ConfigError(
-            f"no scene or scene file is called {name!r}; there are {', '.join(scene_names())}, or the path of a file"
+            f"no scene or scene file is called {name[:80]!r}; there are {', '.join(scene_names())}, "
+            "or the path of a file"
         )
     return place(scene, workspace, table_height_m)
 
@@ -97,6 +100,13 @@ def drop_scene(name: str, shapes: Sequence[Shape], rng: np.random.Generator) -> 
         T = make_transform(_random_rotation(rng), centre)
         objects.append(SceneObject(f"{color} {shape.name} {i + 1}", shape, PALETTE[color], T))
     return Scene(name, tuple(objects), drop=True)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # of a name that no file can have
+        return False
 
 
 def _colors(count: int, rng: np.random.Generator) -> list[str]:

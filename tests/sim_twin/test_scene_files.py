@@ -12,6 +12,7 @@ from robotcell.palette import PALETTE
 from sim_twin.meshes import Mesh, bounds_center
 from sim_twin.scene_files import mesh_frame, read_scene
 from sim_twin.shapes import BLOCK_NAMES, block
+from tests.sim_twin.mutation import mutated
 
 # In mesh axes, the x, y and z axes that V-REP gives the frame of each published mesh (fitted to 23 scenes).
 PUBLISHED_FRAMES = {
@@ -160,6 +161,10 @@ def test_frames_toml_stands_above_the_rule(tmp_path):
     ("text", "message"),
     [
         ("x = [1, 0", "not a TOML file"),
+        ("x = " + 5000 * "1", "not a TOML file"),
+        ("x = " + 3000 * "[", "nested too deeply"),
+        ('["q.obj"]\nx = [1, 0, 0]\ny = [0, 1, 0]\n', "no mesh 'q.obj'"),
+        ('["p.obj"]\nx = [true, 0, 0]\ny = [0, 1, 0]\n', "p.obj, x, 0"),
         ('["p.obj"]\nx = [1, 0, 0]\n', "p.obj, y"),
         ('["p.obj"]\nx = [1, 0, 0]\ny = [1, 1, 0]\n', "p.obj: x and y must be unit vectors"),
     ],
@@ -171,6 +176,17 @@ def test_a_malformed_frames_toml_is_refused(tmp_path, text, message):
         scene_of(tmp_path, "red p.obj -0.5 0 0.0125 0 0 0\n", tmp_path)
 
 
+TOML = """
+name = "mesh"
+center = [0.1, 0.0]
+yaw = 1.5
+[[object]]
+name = "it"
+mesh = "cube.obj"
+color = [1, 2, 3]
+position = [0.05, 0.0, 0.0125]
+rotation = [0.1, 0.2, 0.3]
+"""
 GOOD_ROW = "red cube.obj -0.5 0 0.025 0 0 0\n"
 
 
@@ -185,6 +201,10 @@ GOOD_ROW = "red cube.obj -0.5 0 0.025 0 0 0\n"
         (GOOD_ROW + "red cube.obj -0.5 0 0 0 inf 0\n", "line 2: beta is 'inf'"),
         (GOOD_ROW + "red cube.stl -0.5 0 0 0 0 0\n", "line 2: 'cube.stl' is not the name of an OBJ file"),
         (GOOD_ROW + "red none.obj -0.5 0 0 0 0 0\n", "line 2: there is no none.obj in"),
+        (GOOD_ROW + "red cube.obj -0.5 0 0_1 0 0 0\n", "line 2: z is '0_1', which is no number"),
+        (GOOD_ROW + "red cube.obj -0.5 0 \u0661 0 0 0\n", "line 2: z is '\u0661', which is no number"),
+        (GOOD_ROW + "red cube.obj -0.5 0 0 1e308 0 0\n", "line 2: alpha is '1e308'; it must lie within 1000"),
+        (GOOD_ROW + f"red {5000 * 'a'}.obj -0.5 0 0 0 0 0\n", "line 2: there is no aaa"),
         ("cube.obj 0.1 0.2 1.5 -0.5 0 0 0 0 0\n", "line 1: the colour 0.1 0.2 1.5 is outside 0..1"),
         ("cube.obj 0.1 blue 0.5 -0.5 0 0 0 0 0\n", "line 1: g is 'blue'"),
     ],
@@ -204,6 +224,55 @@ def test_rows_without_their_meshes_are_refused_with_the_option_to_give(tmp_path)
 def test_garbage_rows_are_never_more_than_a_config_error(tmp_path_factory, meshes, text):
     with suppress(ConfigError):
         scene_of(tmp_path_factory.getbasetemp(), text, meshes)
+
+
+def test_rows_may_come_from_windows_and_carry_comments(tmp_path, meshes):
+    pose = "-0.52 0.03 0.025 0.1 0.2 0.3"
+    text = f"\ufeff# colour, mesh, pose\nred ARCH.OBJ {pose}\n  # red cube.obj\nred objects\\blocks\\arch.obj {pose}\n"
+    first, second = scene_of(tmp_path, text, meshes).objects
+    assert (first.shape.name, first.name) == ("arch", "red arch line 2")
+    np.testing.assert_array_equal(first.T_base_object, second.T_base_object)
+
+
+def test_toml_files_may_begin_with_a_byte_order_mark_and_end_in_capitals(tmp_path):
+    write_obj(tmp_path / "p.obj", block("plank").mesh)
+    (tmp_path / "frames.toml").write_text('\ufeff["p.obj"]\nx = [1, 0, 0]\ny = [0, 1, 0]\n', encoding="utf-8")
+    (item,) = scene_of(tmp_path, "red p.obj -0.5 0 0.0125 0 0 0\n", tmp_path).objects
+    np.testing.assert_allclose(item.T_base_object[:3, :3], np.eye(3), atol=1e-9)
+    write_obj(tmp_path / "cube.obj", block("cube").mesh)
+    assert scene_of(tmp_path, "\ufeff" + TOML, tmp_path, suffix=".TOML").name == "mesh"
+
+
+def test_objects_that_name_the_same_mesh_share_its_shape(tmp_path, meshes):
+    entry = TOML[TOML.index("[[") :]
+    first, second = scene_of(tmp_path, TOML + entry.replace('"it"', '"other"'), meshes, suffix=".toml").objects
+    assert first.shape is second.shape
+
+
+INTRUDERS = ["1e400", "nan", "-1e300", "9" * 5000, "\0", "\u0663", "0_1", "#", "[[[", "true", "a" * 5000 + ".obj", "="]
+
+
+@given(data=st.data())
+def test_mutated_rows_are_never_more_than_a_config_error(tmp_path_factory, meshes, data):
+    rows = data.draw(st.sampled_from([2 * GOOD_ROW, 2 * "cube.obj 0.1 0.2 0.5 -0.5 0 0 0 0 0\n"]))
+    with suppress(ConfigError):
+        scene_of(tmp_path_factory.getbasetemp(), mutated(data, rows, INTRUDERS), meshes)
+
+
+@given(data=st.data())
+def test_a_mutated_toml_scene_is_never_more_than_a_config_error(tmp_path_factory, meshes, data):
+    with suppress(ConfigError):
+        scene_of(tmp_path_factory.getbasetemp(), mutated(data, TOML, INTRUDERS), meshes, suffix=".toml")
+
+
+@given(data=st.data())
+def test_a_mutated_frames_toml_is_never_more_than_a_config_error(tmp_path_factory, data):
+    folder = tmp_path_factory.getbasetemp()
+    write_obj(folder / "p.obj", block("plank").mesh)
+    text = mutated(data, '["p.obj"]\nx = [1, 0, 0]\ny = [0, 1, 0]\n', INTRUDERS)
+    (folder / "frames.toml").write_text(text, encoding="utf-8")
+    with suppress(ConfigError):
+        scene_of(folder, "red p.obj -0.5 0 0.0125 0 0 0\n", folder)
 
 
 @given(text=st.text(max_size=60))
@@ -258,6 +327,12 @@ OBJECT = {"name": '"a"', "shape": '"cube"', "color": '"red"', "position": "[0, 0
         ({"wieght": "1"}, "object 1, wieght: Extra inputs"),
         ({"position": "[0, 0]"}, "object 1, position, 2: Field required"),
         ({"position": "[0, 0, nan]"}, "object 1, position, 2: Input should be a finite"),
+        ({"position": '["0", 0, 0]'}, "object 1, position, 0: Input should be a valid number"),
+        ({"position": "[true, 0, 0]"}, "object 1, position, 0: Input should be a valid number"),
+        ({"position": f"[0, 0, 1{5000 * '0'}]"}, "not a TOML file"),
+        ({"rotation": "[1e200, 1e200, 0]"}, "object 1, rotation, 0: Input should be less"),
+        ({"rotation": 3000 * "["}, "nested too deeply"),
+        ({"shape": None, "mesh": f'"{5000 * "m"}.obj"'}, "object 'a': no mesh 'mmm"),
         ({"color": '"mauve"'}, "object 1: color 'mauve' has no such name; there are blue"),
         ({"color": "[1, 2, 300]"}, "object 1, color.*255"),
         ({"shape": '"ball"'}, "object 1: shape 'ball' is no block; there are triangular_prism"),

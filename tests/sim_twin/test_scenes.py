@@ -211,6 +211,25 @@ def test_an_unknown_scene_is_refused_with_the_list():
         made("chaos")
 
 
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ConfigError, match="no scene or scene file"):
+        made(5000 * "a")
+
+
+def test_a_folder_of_meshes_that_a_scene_does_not_use_is_refused(tmp_path):
+    for name in ("random", CHALLENGING[0]):
+        with pytest.raises(ConfigError, match=f"'{name}'.*--meshes"):
+            made(name, meshes=tmp_path)
+
+
+def test_a_folder_of_meshes_that_is_none_is_refused(tmp_path):
+    path = tmp_path / "scene.txt"
+    path.write_text("red a.obj -0.5 0 0 0 0 0", encoding="utf-8")
+    for folder in (path, tmp_path / "none"):
+        with pytest.raises(ConfigError, match="no such folder; --meshes"):
+            made(str(path), meshes=folder)
+
+
 def test_a_scene_without_objects_is_refused():
     with pytest.raises(ConfigError, match="at least one object"):
         made("random", 0)
