@@ -9,9 +9,9 @@ from rich.text import Text
 
 from robotcell.errors import CellError, ConfigError, NoTarget
 
-NOT_COMPLETE = 1
-WRONG_USAGE = 2
-STOPPED = 3
+_NOT_COMPLETE = 1
+_WRONG_USAGE = 2
+_STOPPED = 3
 
 _WIDE = 200
 
@@ -29,8 +29,8 @@ def progress() -> Console:
 def exit_code(error: CellError) -> int:
     """The exit code that tells the operator what kind of thing to do next."""
     if isinstance(error, ConfigError):
-        return WRONG_USAGE
-    return NOT_COMPLETE if isinstance(error, NoTarget) else STOPPED
+        return _WRONG_USAGE
+    return _NOT_COMPLETE if isinstance(error, NoTarget) else _STOPPED
 
 
 def report_error(error: CellError) -> int:

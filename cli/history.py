@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import isnan
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -20,8 +21,12 @@ if TYPE_CHECKING:
 def list_jobs(cell_file: Path | None, limit: int) -> int:
     """Print the newest jobs; returns the exit code."""
     try:
-        with Journal(load_config(cell_file).journal.database_url()) as journal:
-            rows = [(job, journal.metrics(job.id)) for job in journal.jobs(limit)]
+        place = load_config(cell_file).journal
+        if place.url is None and not place.default_file.exists():
+            rows = []
+        else:
+            with Journal(place.database_url()) as journal:
+                rows = [(job, journal.metrics(job.id)) for job in journal.jobs(limit)]
     except CellError as error:
         return report_error(error)
     out = results()
@@ -34,7 +39,7 @@ def list_jobs(cell_file: Path | None, limit: int) -> int:
             str(job.id),
             f"{job.started:%Y-%m-%d %H:%M:%S}",
             _goal(job),
-            job.policy,
+            Text(job.policy),
             job.status,
             str(metrics.grasp_successes),
             str(metrics.actions),
@@ -53,17 +58,18 @@ def show_job(cell_file: Path | None, job_id: int) -> int:
     except CellError as error:
         return report_error(error)
     out = results()
-    out.print(f"job {job.id}: pick {_goal(job)} with {job.policy}, {job.status}", style="bold")
+    out.print(Text(f"job {job.id}: pick {_goal(job)} with {job.policy}, {job.status}", style="bold"), soft_wrap=True)
     if job.reason:
-        out.print(job.reason, soft_wrap=True)
+        out.print(Text(job.reason), soft_wrap=True)
     out.print(_actions(job))
     out.print(_figures(metrics))
-    out.print(f"pictures: {job.run_dir}", soft_wrap=True)
+    out.print(Text(f"pictures: {job.run_dir}"), soft_wrap=True)
     return 0
 
 
 def _actions(job: Job) -> Table:
-    table = Table("", "goal", "action", "x, y, z [m]", "angle [deg]", "q", "seconds", "result", "detail")
+    headings = ("", "goal", "action", "x, y, z [m]", "angle [deg]", "q", "seconds", "result", "detail")
+    table = Table(*(escape(heading) for heading in headings))
     for index, action in enumerate(job.actions, start=1):
         outcome = action.outcome
         table.add_row(
@@ -74,8 +80,8 @@ def _actions(job: Job) -> Table:
             f"{22.5 * action.rotation:.1f}",
             f"{action.q_value:.2f}",
             f"{outcome.ended_s - action.started_s:.1f}" if outcome else "",
-            outcome.result if outcome else "cut off",
-            outcome.detail if outcome else "",
+            Text(outcome.result if outcome else "cut off"),
+            Text(outcome.detail if outcome else "", overflow="fold"),
         )
     return table
 

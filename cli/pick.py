@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
-from cli.console import NOT_COMPLETE, progress, report_error, results
+from cli.console import progress, report_error, results
 from policy import make_policy
 from robotcell.album import Album, describe, draw_decision, save_picture
 from robotcell.cell import open_cell
 from robotcell.config import CellConfig, load_config
-from robotcell.errors import CellError, ConfigError
-from robotcell.jobs import Decision, Outcome, Report, View, preview, run_job
+from robotcell.errors import CellError, ConfigError, NoTarget
+from robotcell.jobs import Decision, Outcome, Report, View, make_run_dir, preview, run_job
 from robotcell.journal import Journal
 from robotcell.perception import check_goal_word
+from robotcell.safety import check_config
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,24 +39,26 @@ def run_pick(
     as_json: bool,
 ) -> int:
     """Run the command; returns the exit code. Progress and errors go to stderr, results to stdout."""
-    err = progress()
     started = time.perf_counter()
+    report, error = None, None
     try:
         goals = _goals(goal, everything)
         config = load_config(cell_file, overrides)
+        check_config(config)
         if dry_run:
-            return _dry_run(goals, config, err, as_json=as_json)
-        report = _run(goals, config, err)
-    except CellError as error:
-        if as_json:
-            _print_json({"completed": False, "error": str(error), "wall_s": round(time.perf_counter() - started, 3)})
-        return report_error(error)
-    summary = _summary(report, time.perf_counter() - started)
+            return _dry_run(goals, config, as_json=as_json)
+        report, error = _run(goals, config, progress())
+    except CellError as refusal:
+        error = refusal
+    if error is None and report is not None and not report.completed:
+        # What is asked for is not there, or was given up.
+        error = NoTarget(report.reason)
+    summary = _summary(report, str(error) if error else "", time.perf_counter() - started)
     if as_json:
         _print_json(summary)
-    else:
+    elif report is not None:
         _print_summary(summary, results())
-    return 0 if report.completed else NOT_COMPLETE
+    return report_error(error) if error else 0
 
 
 def _goals(goal: str | None, everything: bool) -> tuple[str, ...] | None:
@@ -67,26 +70,36 @@ def _goals(goal: str | None, everything: bool) -> tuple[str, ...] | None:
     return tuple(check_goal_word(word.strip()) for word in goal.split(","))
 
 
-def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> Report:
+def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tuple[Report | None, CellError | None]:
+    """Run a job to its end; the report, and the error that stopped it. Whatever started leaves its pictures."""
     with ExitStack() as stack:
         policy = make_policy(config.policy.name, config)
         journal = stack.enter_context(Journal(config.journal.database_url()))
         status = stack.enter_context(err.status(f"opening the cell ({config.backend.name})"))
         cell = stack.enter_context(open_cell(config))
-        album = Album(config)
-        report = run_job(cell, policy, journal, goals, (album, _Progress(err, status)))
+        album, following = Album(config), _Progress(err, status)
+        error = None
+        try:
+            report = run_job(cell, policy, journal, goals, (album, following))
+        except CellError as stop:
+            if following.job is None:
+                raise
+            job_id, run_dir = following.job
+            error = stop
+            report = Report(
+                job_id, run_dir, False, str(stop), journal.metrics(job_id), journal.job(job_id).cell_s or 0.0
+            )
         status.update("drawing the summary")
         album.finish("complete" if report.completed else f"not complete: {report.reason}")
-        return report
+        return report, error
 
 
-def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, err: Console, *, as_json: bool) -> int:
+def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, *, as_json: bool) -> int:
     goal = goals[0] if goals else None
     policy = make_policy(config.policy.name, config)
-    with err.status("looking, deciding and planning"), open_cell(config) as cell:
+    with progress().status("looking, deciding and planning"), open_cell(config) as cell:
         decision, plan = preview(cell, policy, goal)
-    path = config.journal.runs / "dry-run.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = make_run_dir(config.journal.runs, "dry-run") / "plan.png"
     save_picture(draw_decision(decision, config, f"{describe(decision)}: dry run, nothing moved"), path)
     steps = [step.label for step in plan.steps]
     if as_json:
@@ -104,9 +117,9 @@ def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, err: Console, *,
         )
         return 0
     out = results()
-    out.print(f"{describe(decision)}; the plan is safe, nothing moved")
-    out.print(f"steps: {', '.join(steps)}")
-    out.print(f"picture: {path}", soft_wrap=True)
+    out.print(Text(f"{describe(decision)}; the plan is safe, nothing moved"), soft_wrap=True)
+    out.print(Text(f"steps: {', '.join(steps)}"), soft_wrap=True)
+    out.print(Text(f"picture: {path}"), soft_wrap=True)
     return 0
 
 
@@ -116,10 +129,13 @@ class _Progress:
     def __init__(self, console: Console, status: Status) -> None:
         self._console = console
         self._status = status
+        # The job's number and folder, once it has started.
+        self.job: tuple[int, Path] | None = None
 
     def started(self, job_id: int, run_dir: Path) -> None:
         """Say where the run is recorded."""
-        self._console.print(f"job {job_id}, {run_dir}", soft_wrap=True)
+        self.job = job_id, run_dir
+        self._console.print(Text(f"job {job_id}, {run_dir}"), soft_wrap=True)
         self._status.update("looking")
 
     def looked(self, view: View) -> None:
@@ -140,21 +156,22 @@ class _Progress:
         )
 
 
-def _summary(report: Report, wall_s: float) -> dict[str, Any]:
-    metrics = report.metrics
+def _summary(report: Report | None, reason: str, wall_s: float) -> dict[str, Any]:
+    """What came of the command; zeros where no job was started."""
+    metrics = report.metrics if report else None
     return {
-        "completed": report.completed,
-        "reason": report.reason,
-        "picked": metrics.grasp_successes,
-        "picked_objects": list(metrics.picked),
-        "actions": metrics.actions,
-        "pushes": metrics.pushes,
-        "grasp_attempts": metrics.grasp_attempts,
-        "grasp_successes": metrics.grasp_successes,
-        "simulated_s": round(report.cell_s, 3),
+        "completed": report.completed if report else False,
+        "reason": reason,
+        "picked": metrics.grasp_successes if metrics else 0,
+        "picked_objects": list(metrics.picked) if metrics else [],
+        "actions": metrics.actions if metrics else 0,
+        "pushes": metrics.pushes if metrics else 0,
+        "grasp_attempts": metrics.grasp_attempts if metrics else 0,
+        "grasp_successes": metrics.grasp_successes if metrics else 0,
+        "simulated_s": round(report.cell_s, 3) if report else 0.0,
         "wall_s": round(wall_s, 3),
-        "job": report.job_id,
-        "run_dir": str(report.run_dir),
+        "job": report.job_id if report else None,
+        "run_dir": str(report.run_dir) if report else None,
     }
 
 

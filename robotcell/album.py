@@ -77,7 +77,11 @@ class Album:
         save_picture(page, self._folder / "end.png")
         pages = [*self._pages, _small(page)]
         durations = [_ANIMATION_STEP_MS] * (len(pages) - 1) + [_ANIMATION_END_MS]
-        pages[0].save(self._folder / "summary.gif", save_all=True, append_images=pages[1:], duration=durations, loop=0)
+        path = self._folder / "summary.gif"
+        try:
+            pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
+        except OSError as error:
+            raise _not_written(path) from error
 
 
 def describe(decision: Decision) -> str:
@@ -127,7 +131,11 @@ def save_picture(picture: _Picture, path: Path) -> None:
         CellError: it cannot be written.
     """
     if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise CellError(f"{path} cannot be written: check that its folder exists and the disk has room")
+        raise _not_written(path)
+
+
+def _not_written(path: Path) -> CellError:
+    return CellError(f"{path} cannot be written: check that its folder exists and the disk has room")
 
 
 def _small(page: _Picture) -> Image.Image:

@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from robotcell.config import CellConfig, find_backend
-from robotcell.errors import ConnectionLost, DeviceFault
+from robotcell.errors import ConnectionLost, DeviceFault, GuardTripped
 
 if TYPE_CHECKING:
     from types import TracebackType
 
     from robotcell.interfaces import Arm, Camera, Clock, Gripper
+
+
+class Latch:
+    """Remembers a safety violation until an operator clears it. Every executor of a cell shares it."""
+
+    def __init__(self) -> None:
+        self._violation: str | None = None
+
+    @property
+    def violation(self) -> str | None:
+        """What tripped it, or None."""
+        return self._violation
+
+    def trip(self, what: str) -> None:
+        """Latch a violation; the first one stands."""
+        self._violation = self._violation or what
+
+    def clear(self) -> None:
+        """Forget the violation. Only ever called because an operator asked for it."""
+        self._violation = None
+
+    def check(self) -> None:
+        """Raise GuardTripped if a violation is latched."""
+        if self._violation:
+            raise GuardTripped(f"nothing moves after a safety stop ({self._violation}); look at the cell, then recover")
 
 
 @dataclass(frozen=True)
@@ -23,6 +48,7 @@ class Cell:
     gripper: Gripper
     camera: Camera
     clock: Clock
+    latch: Latch = field(default_factory=Latch)
 
     def __enter__(self) -> Cell:
         """Connect every device, so that one attempt shows everything that is wrong.

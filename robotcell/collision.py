@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 # Distance of the upper arm's tube from the plane of the base, along the shoulder axis (UR5e drawing: 0.138 m).
 _UPPER_ARM_OFFSET_M = 0.138
 _SPACING_M = 0.03
+FINGER_SPACING_M = 0.014
 # The camera's housing and its post stand behind its optical centre.
 _CAMERA_M = 0.12
 _POST_M = 0.06
@@ -128,10 +129,35 @@ def self_distance(centers: Array) -> npt.NDArray[np.float64]:
 
 
 def finger_points(T_base_tcp: Array, load_m: float) -> Array:
-    """Points (..., K, 3) [m] that stand for the open fingers and for a load that reaches `load_m` below the tcp."""
+    """Points (..., K, 3) [m] that stand for the fingers and for a load that reaches `load_m` below the tcp.
+
+    They fill the block that the fingers can be in, from palm to tip and opened any way, at most
+    `FINGER_SPACING_M` apart.
+    """
     half = linkage.MAX_WIDTH_M / 2 + linkage.FINGER_THICKNESS_M
-    tips = np.array([(side * half, 0.0, z) for side in (-1, 0, 1) for z in (-0.06, -0.03, load_m)])
-    return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], tips) + T_base_tcp[..., None, :3, 3])
+    x = np.linspace(-half, half, int(2 * half / FINGER_SPACING_M) + 2)
+    y = np.array([-0.5, 0.0, 0.5]) * linkage.FINGER_BREADTH_M
+    reach = linkage.CLOSED_LENGTH_M - linkage.PALM_M + load_m
+    z = load_m - np.linspace(0.0, reach, int(reach / FINGER_SPACING_M) + 2)
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], grid) + T_base_tcp[..., None, :3, 3])
+
+
+def blocks_view(q: npt.ArrayLike, config: CellConfig) -> bool:
+    """Whether arm or gripper at joint angles q (6,) stand between the camera and the workspace."""
+    eye = config.camera.pose()[:3, 3]
+    T_tcp = kinematics.forward(q) @ linkage.T_FLANGE_TCP
+    fingers = finger_points(T_tcp, 0.0)
+    centers = np.concatenate([sphere_centers(q), fingers])
+    radii = np.concatenate([SPHERES.radius, np.full(len(fingers), FINGER_SPACING_M)])
+    below = centers[:, 2] < eye[2] - radii
+    away = centers[below] - eye
+    # Their shadows on the table, as if the camera were a lamp.
+    stretch = (eye[2] - config.table.height_m) / -away[:, 2]
+    x, y = (eye[:2] + stretch[:, None] * away[:, :2]).T
+    size = radii[below] * stretch * np.linalg.norm(away, axis=1) / -away[:, 2]
+    (x0, x1), (y0, y1) = config.workspace.x, config.workspace.y
+    return bool(((x > x0 - size) & (x < x1 + size) & (y > y0 - size) & (y < y1 + size)).any())
 
 
 def _sphere_pairs() -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -121,7 +121,7 @@ class Motion(_Table):
 class Limits(_Table):
     """What the safety layer allows. It adds to the controller's own safety settings and never replaces them."""
 
-    # The tcp stays inside this box (the workspace, the bin and the way between them).
+    # The tcp stays inside this box (the workspace, the bin and the way between them); z is above the table.
     x: Interval = (-0.80, 0.20)
     y: Interval = (-0.45, 0.65)
     z: Interval = (0.0, 0.70)
@@ -188,9 +188,14 @@ class JournalPlace(_Table):
     url: str | None = None
     runs: Path = Path("runs")
 
+    @property
+    def default_file(self) -> Path:
+        """The SQLite file that is the journal when no URL is given."""
+        return self.runs / "journal.db"
+
     def database_url(self) -> str:
         """The SQLAlchemy URL of the journal."""
-        return self.url or f"sqlite:///{self.runs / 'journal.db'}"
+        return self.url or f"sqlite:///{self.default_file}"
 
 
 class BackendChoice(_Table):

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import enum
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.errors import ConnectionLost, DeviceFault, GuardTripped
+from robotcell.errors import CellError, DeviceFault, GuardTripped
 from robotcell.geometry import rotation_angle
 from robotcell.primitives import CheckHold, Grip, JointMove, LinearMove
+from robotcell.safety import Guard
 
 if TYPE_CHECKING:
     from robotcell.cell import Cell
     from robotcell.geometry import Array
     from robotcell.primitives import MotionPlan, Step
-    from robotcell.safety import CheckedPlan, Guard
+    from robotcell.safety import CheckedPlan
 
 # 125 Hz: the slower of the two rates at which UR controllers report.
 PERIOD_S = 0.008
 # The fingers need 1 s for their full stroke; a gripper that is busy for longer hangs.
 _GRIP_TIMEOUT_S = 3.0
+# A commanded motion in which no joint turns further than this for so long was paused, or its speed slider is at zero.
+_STALL_S = 3.0
+_STILL_RAD = 0.005
 # A stop from the highest speed that the limits allow takes far less.
 _STOP_TIMEOUT_S = 2.0
 # How far from its target a motion may have ended.
@@ -55,34 +60,34 @@ class Execution:
 
 
 class Executor:
-    """Runs plans on the devices of a cell, one guard over all of them."""
+    """Runs plans on the devices of a cell; the cell's latch stands over all of them."""
 
-    def __init__(self, cell: Cell, guard: Guard) -> None:
+    def __init__(self, cell: Cell) -> None:
         self._cell = cell
-        self._guard = guard
+        self._guard = Guard(cell.config, cell.latch)
 
     def run(self, checked: CheckedPlan) -> Execution:
         """Run a plan to its end, or to the first contact or empty grip.
 
-        However this ends, by an exception or by an interrupt as well, the arm stands still afterwards.
+        However this ends, by an exception or by an interrupt as well, arm and fingers stand still afterwards, and
+        whatever ended it early is latched.
 
         Raises:
             GuardTripped, DeviceFault, ConnectionLost, UnsafeMotion: as the guard and the devices do.
         """
         plan = checked.plan
-        self._guard.check_start(self._cell.arm.state(), plan)
+        self._guard.check_start(self._cell.arm.state(), self._cell.clock.now(), plan)
         try:
             return self._run_steps(plan)
         except BaseException as error:
-            if not isinstance(error, (GuardTripped, DeviceFault)):
-                self._guard.trip(f"{plan.label} was cut short: {error or type(error).__name__}")
+            self._cell.latch.trip(f"{plan.label} was cut short: {error if str(error) else type(error).__name__}")
             self._stop()
             raise
 
     def recover(self) -> None:
         """Leave a stop, because an operator asked for it. The next plan starts from measured joints."""
         self._cell.arm.recover()
-        self._guard.clear()
+        self._cell.latch.clear()
 
     def _run_steps(self, plan: MotionPlan) -> Execution:
         peak_force, width = 0.0, float("nan")
@@ -112,9 +117,17 @@ class Executor:
         else:
             arm.start_linear(step.T_base_tcp, step.speed_m_s, step.acceleration_m_s2)
         peak, contact = 0.0, False
+        moved_at, q_moved = self._cell.clock.now(), arm.state().q
         while arm.moving:
-            state = arm.state()
-            self._guard.check(state, self._cell.clock.now())
+            state, now = arm.state(), self._cell.clock.now()
+            self._guard.check(state, now)
+            if float(np.abs(state.q - q_moved).max()) > _STILL_RAD:
+                moved_at, q_moved = now, state.q
+            elif now - moved_at > _STALL_S:
+                raise GuardTripped(
+                    f"step {step.label!r} stood still for {_STALL_S:.0f} s: check the speed slider and that the "
+                    "program is not paused, look at the cell, then recover"
+                )
             if contact_force is not None and not contact:
                 force = float(np.linalg.norm((state.wrench - wrench_before)[:3]))
                 peak = max(peak, force)
@@ -138,19 +151,22 @@ class Executor:
             turned = rotation_angle(T_base_tcp[:3, :3], step.T_base_tcp[:3, :3])
             reached, missing = off <= _REACHED_M and turned <= _REACHED_RAD, f"{1000 * off:.1f} mm"
         if not reached:
-            what = f"step {step.label!r} ended {missing} from its target"
-            self._guard.trip(what)
-            raise GuardTripped(f"{what}: something stopped the arm; look at the cell, then recover")
+            raise GuardTripped(
+                f"step {step.label!r} ended {missing} from its target: something stopped the arm; look at the cell, "
+                "then recover"
+            )
 
     def _grip(self, step: Grip) -> None:
-        gripper, clock = self._cell.gripper, self._cell.clock
+        """Move the fingers; the arm stands, and is watched and kept awake all the same."""
+        arm, gripper, clock = self._cell.arm, self._cell.gripper, self._cell.clock
         gripper.start_width(step.width_m, step.force_n)
         deadline = clock.now() + _GRIP_TIMEOUT_S
         # The first sleep lets a command reach the fingers before they are asked whether they move.
         clock.sleep(PERIOD_S)
         while gripper.state().busy:
+            self._guard.check(arm.state(), clock.now())
+            arm.kick()
             if clock.now() > deadline:
-                gripper.stop()
                 raise DeviceFault(
                     f"the gripper was still busy {_GRIP_TIMEOUT_S:.0f} s after {step.label!r}; "
                     "power-cycle it at the Compute Box, then recover"
@@ -158,14 +174,13 @@ class Executor:
             clock.sleep(PERIOD_S)
 
     def _stop(self) -> None:
-        """Stop arm and fingers and wait for standstill; a lost arm is stopped by its own controller."""
-        arm, clock = self._cell.arm, self._cell.clock
-        try:
+        """Stop arm and fingers and wait for standstill; an arm that is lost is stopped by its own controller."""
+        arm, gripper, clock = self._cell.arm, self._cell.gripper, self._cell.clock
+        with suppress(CellError):
+            gripper.stop()
+        with suppress(CellError):
             arm.stop()
             deadline = clock.now() + _STOP_TIMEOUT_S
             while arm.moving and clock.now() < deadline:
                 arm.kick()
                 clock.sleep(PERIOD_S)
-        except ConnectionLost:
-            # Without kicks the controller's watchdog stops the arm.
-            return

@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Protocol
 import cv2
 import numpy as np
 
+from robotcell.collision import blocks_view
 from robotcell.decision import Action, Observation, Policy, Primitive
-from robotcell.errors import CalibrationError, CellError, DeviceFault, NoTarget, UnsafeMotion
+from robotcell.errors import CalibrationError, CellError, ConfigError, DeviceFault, NoTarget, UnsafeMotion
 from robotcell.executor import Ending, Execution, Executor
-from robotcell.heightmap import Heightmap, build_heightmap
+from robotcell.heightmap import Heightmap, build_heightmap, close_gaps
 from robotcell.journal import ActionRow, Frame, Journal, Metrics, OutcomeRow
 from robotcell.perception import Instance, Segmentation, find_goal, segment
 from robotcell.primitives import HELD_AFTER_LIFT, plan_action, plan_retreat
-from robotcell.safety import Guard, check_plan
+from robotcell.safety import check_config, check_plan
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,8 +38,10 @@ MAX_FAILURES_IN_A_ROW = 10
 _CHANGED_M = 0.010
 # An object has left its place when this share of the cells that show it is lower than before.
 _GONE_SHARE = 0.6
-# A push that changes fewer cells than this (4 cm2 at 2 mm) moved nothing.
-_MOVED_CELLS = 100
+# A push after which less of the table than this looks different moved nothing: a third of a block's smallest face.
+_MOVED_M2 = 400e-6
+# What changed must be at least this wide to count: the noise of depth flickers along edges, a cell or two wide.
+_MOVED_WIDTH_M = 0.007
 # The fingers can only have taken an object that was seen this close to them.
 _REACH_M = 0.06
 
@@ -56,6 +59,10 @@ class Result(str, enum.Enum):
     NOTHING_MOVED = "nothing moved"
     REFUSED = "refused"  # the plan was unsafe; nothing moved
     STOPPED = "stopped"  # a device or the safety layer stopped the cell
+
+
+# After these the scene is another one, and what failed before may work now.
+_SCENE_CHANGED = {Result.PICKED, Result.WRONG_OBJECT, Result.PUSHED, Result.LOST, Result.UNCONFIRMED}
 
 
 @dataclass(frozen=True)
@@ -132,15 +139,19 @@ def look(cell: Cell) -> View:
         CalibrationError: the table is not where the configuration has it.
     """
     config, limits = cell.config, cell.config.limits
+    if blocks_view(cell.arm.state().q, config):
+        raise DeviceFault("the arm stands between the camera and the workspace: move it to the home pose, then look")
     frame = cell.camera.read()
     age = cell.clock.now() - frame.t
     if age > limits.frame_age_s:
         raise DeviceFault(f"frame {frame.number} is {age:.2f} s old (limit {limits.frame_age_s} s): check the camera")
     heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
-    if heightmap.coverage < limits.min_coverage:
+    # Without the gaps between pixels, which say something of the resolution and nothing of the view.
+    coverage = float(np.isfinite(close_gaps(heightmap.height_m)).mean())
+    if coverage < limits.min_coverage:
         raise DeviceFault(
-            f"the camera sees {heightmap.coverage:.0%} of the workspace (limit {limits.min_coverage:.0%}): "
-            "check its view, its lens and the light"
+            f"the camera sees {coverage:.0%} of the workspace (limit {limits.min_coverage:.0%}): check its view, its "
+            "lens and the light; cells finer than its pixels (workspace.resolution_m) stay empty too"
         )
     table = heightmap.table
     if table is None:
@@ -158,8 +169,9 @@ def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, Mot
     """Look, decide, plan and check one action; nothing moves.
 
     Raises:
-        NoTarget, UnsafeMotion and what `look` raises.
+        ConfigError, NoTarget, UnsafeMotion and what `look` raises.
     """
+    check_config(cell.config)
     view = look(cell)
     action = policy.decide(_observe(view, goal, (), may_push=True))
     plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
@@ -175,25 +187,28 @@ def run_job(
 ) -> Report:
     """Pick the goals (colours) in their order, or with None everything on the table.
 
+    A goal that is not on the table when its turn comes ends the job; the report's reason lists what is there.
+
     Raises:
-        NoTarget: a goal is not on the table when its turn comes; the message lists what is.
-        DeviceFault, ConnectionLost, GuardTripped, CalibrationError: the cell was stopped. The journal has it.
+        ConfigError: the configuration does not fit together, or the folder of the run cannot be made.
+        DeviceFault, ConnectionLost, GuardTripped, CalibrationError, UnsafeMotion: the cell was stopped. The journal
+            has it; after a motion was cut short, the cell's latch holds until `Executor.recover`.
     """
-    run_dir = _make_run_dir(cell.config.journal.runs, goals)
+    check_config(cell.config)
+    run_dir = make_run_dir(cell.config.journal.runs, "-".join(goals) if goals else "all")
     started = cell.clock.now()
     status, reason = "stopped", ""
-    job_id = journal.start_job(goals, policy.name, cell.config.model_dump(mode="json"), run_dir)
+    # A database URL may hold a password.
+    settings = cell.config.model_dump(mode="json", exclude={"journal": {"url"}})
+    job_id = journal.start_job(goals, policy.name, settings, run_dir)
     try:
         for observer in observers:
             observer.started(job_id, run_dir)
         job = _Job(cell, policy, journal, observers, job_id, run_dir)
         reason = job.pick_in_order(goals) if goals else job.pick_all()
         status = "incomplete" if reason else "complete"
-    except NoTarget as error:
-        status, reason = "incomplete", str(error)
-        raise
     except BaseException as error:
-        reason = str(error) or type(error).__name__
+        reason = _describe(error)
         raise
     finally:
         cell_s = cell.clock.now() - started
@@ -210,18 +225,15 @@ class _Job:
     job_id: int
     run_dir: Path
     actions: int = 0
-    guard: Guard = field(init=False)
     executor: Executor = field(init=False)
 
     def __post_init__(self) -> None:
-        self.guard = Guard(self.cell.config)
-        self.executor = Executor(self.cell, self.guard)
+        self.executor = Executor(self.cell)
 
     def pick_in_order(self, goals: tuple[str, ...]) -> str:
         """Pick one goal after the other; "" or why it was given up."""
         view = self._start()
         for goal in goals:
-            find_goal(view.segmentation, goal)
             view, reason = self._pick_until(goal, view)
             if reason:
                 return reason
@@ -258,8 +270,12 @@ class _Job:
                 return view, str(error)
             view, outcome = self._act(goal, view, action)
             pushes = pushes + 1 if action.primitive is Primitive.PUSH else 0
-            failures = 0 if outcome.success else failures + 1
-            barred = () if outcome.result in {Result.PICKED, Result.WRONG_OBJECT, Result.PUSHED} else (*barred, action)
+            # A push that moved something is no failure, but only a pick is what the attempts are for.
+            if outcome.result is Result.PICKED:
+                failures = 0
+            elif not outcome.success:
+                failures += 1
+            barred = () if outcome.result in _SCENE_CHANGED else (*barred, action)
             if outcome.result is Result.PICKED and goal is not None:
                 return view, ""
             if failures >= MAX_FAILURES_IN_A_ROW:
@@ -295,7 +311,7 @@ class _Job:
         try:
             after, outcome = self._run(decision)
         except BaseException as error:
-            self._end_action(action_id, decision, Outcome(Result.STOPPED, None, str(error), float("nan")))
+            self._end_action(action_id, decision, Outcome(Result.STOPPED, None, _describe(error), float("nan")))
             raise
         self._end_action(action_id, decision, outcome)
         return after, outcome
@@ -368,9 +384,9 @@ def judge(decision: Decision, after: View, execution: Execution) -> Outcome:
 
 
 def _judge_push(decision: Decision, after: View, execution: Execution) -> Outcome:
-    changed = _changed(decision.view.heightmap, after.heightmap)
-    result = Result.PUSHED if changed >= _MOVED_CELLS else Result.NOTHING_MOVED
-    return Outcome(result, None, f"{changed} cells changed", execution.peak_force_n)
+    changed = _changed_area(decision.view.heightmap, after.heightmap)
+    result = Result.PUSHED if changed >= _MOVED_M2 else Result.NOTHING_MOVED
+    return Outcome(result, None, f"{1e4 * changed:.0f} cm2 of the table changed", execution.peak_force_n)
 
 
 def _judge_grasp(decision: Decision, after: View, execution: Execution) -> Outcome:
@@ -424,18 +440,28 @@ def _is_gone(instance: Instance, before: View, after: View) -> bool:
     return bool(place.any() and (sunk | replaced).mean() >= _GONE_SHARE)
 
 
-def _changed(before: Heightmap, after: Heightmap) -> int:
+def _changed_area(before: Heightmap, after: Heightmap) -> float:
+    """How much of the table [m2] is higher or lower than before, edges that flicker left out."""
+    resolution = before.workspace.resolution_m
     with np.errstate(invalid="ignore"):
-        return int((np.abs(before.height_m - after.height_m) > _CHANGED_M).sum())
+        changed = (np.abs(before.height_m - after.height_m) > _CHANGED_M).astype(np.uint8)
+    width = max(3, round(_MOVED_WIDTH_M / resolution))
+    return float(cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((width, width), np.uint8)).sum()) * resolution**2
 
 
-def _make_run_dir(runs: Path, goals: tuple[str, ...] | None) -> Path:
-    """A new folder runs/<time>-<what>, numbered where the second does not tell two runs apart.
+def _describe(error: BaseException) -> str:
+    if isinstance(error, CellError):
+        return str(error)
+    return {KeyboardInterrupt: "interrupted", SystemExit: "terminated"}.get(type(error), repr(error))
+
+
+def make_run_dir(runs: Path, label: str) -> Path:
+    """A new folder runs/<time>-<label>, numbered where the second does not tell two runs apart.
 
     Raises:
-        CellError: it cannot be made.
+        ConfigError: it cannot be made.
     """
-    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{'-'.join(goals) if goals else 'all'}"
+    stem = f"{datetime.now():%Y%m%d-%H%M%S}-{label}"
     for suffix in ("", *(f"-{n}" for n in range(2, 100))):
         path = runs / f"{stem}{suffix}"
         try:
@@ -443,6 +469,6 @@ def _make_run_dir(runs: Path, goals: tuple[str, ...] | None) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise CellError(f"the folder {path} cannot be made: {error.strerror}; set journal.runs") from error
+            raise ConfigError(f"journal.runs = {str(runs)!r}: {path} cannot be made: {error.strerror}") from error
         return path
-    raise CellError(f"there are a hundred runs called {stem} in {runs}")
+    raise ConfigError(f"journal.runs = {str(runs)!r}: there are a hundred runs called {stem}")

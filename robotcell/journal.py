@@ -5,6 +5,7 @@ The figures of the paper's tables are queries over it.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -12,16 +13,20 @@ from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import JSON, ForeignKey, create_engine, event, func, select
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
 
 from robotcell.decision import Primitive
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, DeviceFault
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from typing_extensions import Self
+
+
+# Processes that open a new database together may each find that another has just made a table.
+_CREATE_TRIES = 5
 
 
 class _Base(DeclarativeBase):
@@ -136,16 +141,33 @@ class Journal:
     """
 
     def __init__(self, url: str) -> None:
+        shown = url
         try:
             parsed = make_url(url)
-            if parsed.get_backend_name() == "sqlite" and parsed.database not in {None, "", ":memory:"}:
+            shown = parsed.render_as_string(hide_password=True)
+            is_sqlite = parsed.get_backend_name() == "sqlite"
+            if is_sqlite and parsed.database not in {None, "", ":memory:"}:
                 Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
             self._engine = create_engine(parsed)
-            if parsed.get_backend_name() == "sqlite":
+            if is_sqlite:
                 event.listen(self._engine, "connect", _use_write_ahead_log)
-            _Base.metadata.create_all(self._engine)
+            self._create_tables()
         except (ArgumentError, ImportError, OSError, SQLAlchemyError) as error:
-            raise ConfigError(f"journal.url = {url!r}: the journal cannot be opened: {error}") from error
+            raise ConfigError(f"journal.url = {shown!r}: the journal cannot be opened: {_cause(error)}") from error
+
+    def _create_tables(self) -> None:
+        """Create what is missing, also when another process does so at the same moment."""
+        for attempt in range(_CREATE_TRIES):
+            try:
+                _Base.metadata.create_all(self._engine)
+                return
+            except OperationalError:
+                if attempt == _CREATE_TRIES - 1:
+                    self._engine.dispose()
+                    raise
+            except SQLAlchemyError:
+                self._engine.dispose()
+                raise
 
     def __enter__(self) -> Self:
         return self
@@ -170,7 +192,7 @@ class Journal:
 
     def end_job(self, job_id: int, status: str, reason: str, cell_s: float) -> None:
         """Record how a job ended."""
-        with Session(self._engine) as session, session.begin():
+        with self._writing() as session:
             job = session.get_one(Job, job_id)
             job.status, job.reason, job.cell_s, job.ended = status, reason, cell_s, _now()
 
@@ -184,12 +206,12 @@ class Journal:
 
     def end_action(self, outcome: OutcomeRow) -> None:
         """Record what came of an action."""
-        with Session(self._engine) as session, session.begin():
+        with self._writing() as session:
             session.add(outcome)
 
     def jobs(self, limit: int = 20) -> list[Job]:
         """The newest jobs first, without their actions."""
-        with Session(self._engine, expire_on_commit=False) as session:
+        with self._reading() as session:
             return list(session.scalars(select(Job).order_by(Job.id.desc()).limit(limit)))
 
     def job(self, job_id: int) -> Job:
@@ -198,7 +220,7 @@ class Journal:
         Raises:
             ConfigError: there is none with that id; the message says which ids exist.
         """
-        with Session(self._engine, expire_on_commit=False) as session:
+        with self._reading() as session:
             job = session.get(Job, job_id)
             if job is None:
                 newest = session.scalar(select(func.max(Job.id)))
@@ -216,7 +238,7 @@ class Journal:
             .where(ActionRow.job_id == job_id, OutcomeRow.result != "refused")
             .order_by(ActionRow.id)
         )
-        with Session(self._engine) as session:
+        with self._reading() as session:
             rows = session.execute(ended).all()
             cell_s = session.scalar(select(Job.cell_s).where(Job.id == job_id))
         grasps = [row for row in rows if row.primitive == Primitive.GRASP.value]
@@ -232,10 +254,26 @@ class Journal:
         )
 
     def _add(self, row: Job | Frame | ActionRow) -> int:
-        with Session(self._engine, expire_on_commit=False) as session, session.begin():
+        with self._writing() as session:
             session.add(row)
             session.flush()
             return row.id
+
+    @contextmanager
+    def _reading(self) -> Iterator[Session]:
+        try:
+            with Session(self._engine, expire_on_commit=False) as session:
+                yield session
+        except SQLAlchemyError as error:
+            raise ConfigError(f"the journal cannot be read: {_cause(error)}; is it one of this program?") from error
+
+    @contextmanager
+    def _writing(self) -> Iterator[Session]:
+        try:
+            with Session(self._engine, expire_on_commit=False) as session, session.begin():
+                yield session
+        except SQLAlchemyError as error:
+            raise DeviceFault(f"the journal cannot be written: {_cause(error)}; check disk and database") from error
 
 
 def _use_write_ahead_log(connection: Any, _record: object) -> None:
@@ -244,6 +282,11 @@ def _use_write_ahead_log(connection: Any, _record: object) -> None:
     cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA foreign_keys=ON")
     cursor.close()
+
+
+def _cause(error: Exception) -> str:
+    """The driver's own words; SQLAlchemy adds the statement and a link."""
+    return str(error.orig) if isinstance(error, DBAPIError) else str(error)
 
 
 def _now() -> datetime:

@@ -22,7 +22,7 @@ DH_ALPHA = np.array([np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0])
 # Universal Robots, UR5e user manual: every joint turns by +-360 degrees at up to 180 degrees/s; the elbow, by the
 # arm's own links, by +-180. Acceleration and tool limits are the ranges that the RTDE control interface accepts.
 JOINT_LIMIT = np.array([2 * np.pi, 2 * np.pi, np.pi, 2 * np.pi, 2 * np.pi, 2 * np.pi])
-MAX_JOINT_SPEED = np.pi
+MAX_JOINT_SPEED = 3.14
 MAX_JOINT_ACCELERATION = 40.0
 MAX_TOOL_SPEED = 3.0
 MAX_TOOL_ACCELERATION = 150.0
@@ -62,10 +62,15 @@ def jacobian(q: npt.ArrayLike) -> Array:
     frames = link_frames(q)
     axes = frames[..., :6, :3, 2]
     arms = frames[..., 6, None, :3, 3] - frames[..., :6, :3, 3]
-    # axes x arms, several times faster than np.cross on so few numbers; the guard needs it in every period.
-    turned, turned_twice = [1, 2, 0], [2, 0, 1]
-    linear = axes[..., turned] * arms[..., turned_twice] - axes[..., turned_twice] * arms[..., turned]
-    return np.concatenate([np.swapaxes(linear, -1, -2), np.swapaxes(axes, -1, -2)], axis=-2)
+    return np.concatenate([np.swapaxes(_cross(axes, arms), -1, -2), np.swapaxes(axes, -1, -2)], axis=-2)
+
+
+def tool_speed(q: npt.ArrayLike, qd: npt.ArrayLike, tool_length_m: float) -> npt.NDArray[np.float64]:
+    """Speed (...,) [m/s] of the point `tool_length_m` before the flange, of joint speeds (..., 6) [rad/s]."""
+    q = np.asarray(q, dtype=np.float64)
+    twist = np.einsum("...ij,...j->...i", jacobian(q), np.asarray(qd, dtype=np.float64))
+    offset = tool_length_m * forward(q)[..., :3, 2]
+    return np.asarray(np.linalg.norm(twist[..., :3] + _cross(twist[..., 3:], offset), axis=-1))
 
 
 def distance_to_singularity(q: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -119,3 +124,9 @@ def inverse_along(T_base_flange: Array, q_start: npt.ArrayLike, max_step: float)
             raise ValueError(f"the path passes a singularity at flange {where}: a joint would jump by {step:.2f} rad")
         path[i] = q = solution
     return path
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """A x b of (..., 3), several times faster than np.cross on so few numbers; the guard needs it in every period."""
+    once, twice = [1, 2, 0], [2, 0, 1]
+    return a[..., once] * b[..., twice] - a[..., twice] * b[..., once]

@@ -15,6 +15,7 @@ from robotcell import kinematics, linkage
 from robotcell.decision import Action, Primitive
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import Array, invert_transform, make_transform
+from robotcell.heightmap import close_gaps
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 GRASP_DEPTH_M = 0.040
 # A load gripped 4 cm below its top reaches at most this far below the tcp (the tallest block is 100 mm).
 LOAD_REACH_M = 0.060
+# What the camera did not see may be as tall as the tallest block.
+TALLEST_OBJECT_M = 0.100
+# The gripper is taken to be this much larger all round, for what it comes down beside.
+_AROUND_M = 0.004
 # Label of the first check for a held object; one that passes here and fails later was lost on the way.
 HELD_AFTER_LIFT = "held after the lift"
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
@@ -35,6 +40,8 @@ _CARRY_CLEARANCE_M = 0.03
 _BIN_CLEARANCE_M = 0.12
 # Share of the bin's sides over which objects are let go; what is left is room for their own size.
 _RELEASE_SHARE = 0.5
+# A direction whose component along a side of the workspace is smaller never crosses the other one.
+_PARALLEL = 1e-9
 # A push shorter than this, after it was clamped to the workspace, moves nothing.
 _MIN_PUSH_M = 0.02
 
@@ -130,11 +137,16 @@ def plan_retreat(state: ArmState, config: CellConfig) -> MotionPlan:
 
 
 def push_segment(action: Action, config: CellConfig) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Start and end (x, y) [m] of a push, clamped to the workspace."""
-    x, y, _ = action.xyz
-    workspace, length = config.workspace, config.motion.push_m
-    end_x, end_y = x + length * math.cos(action.theta), y + length * math.sin(action.theta)
-    return _clamp(x, y, workspace.x, workspace.y), _clamp(end_x, end_y, workspace.x, workspace.y)
+    """Start and end (x, y) [m] of a push: the start clamped to the workspace, the way cut off where it leaves it."""
+    workspace = config.workspace
+    start = [min(max(v, low), high) for v, (low, high) in zip(action.xyz, (workspace.x, workspace.y), strict=False)]
+    direction = (math.cos(action.theta), math.sin(action.theta))
+    length = config.motion.push_m
+    for v, d, (low, high) in zip(start, direction, (workspace.x, workspace.y), strict=True):
+        if abs(d) > _PARALLEL:
+            length = min(length, ((high if d > 0 else low) - v) / d)
+    x, y = start
+    return (x, y), (x + length * direction[0], y + length * direction[1])
 
 
 def grasp_height(surface_m: float, config: CellConfig) -> float:
@@ -158,7 +170,7 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
     T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
     T_near, T_grasp, T_lifted = (T_above.copy() for _ in range(3))
     T_lifted[2, 3] = max(approach_z, table + config.bin.wall_height_m + LOAD_REACH_M + _CARRY_CLEARANCE_M)
-    highest = table + _highest_under_gripper(heightmap, x, y)
+    highest = table + _clear_above(heightmap, x, y, theta, use.preshape_m)
     T_near[2, 3] = float(np.clip(highest + _NEAR_M - linkage.tip_retraction(use.preshape_m), tcp_z, approach_z))
     T_grasp[2, 3] = tcp_z
     bin_x, bin_y = _release_point(x, y, config)
@@ -211,7 +223,7 @@ def _plan_push(action: Action, heightmap: Heightmap, q_start: Array, config: Cel
     q_above = _solve("approach", tool_down(x, y, approach_z, action.theta), config)
     T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
     T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
-    highest = table + _highest_under_gripper(heightmap, x, y)
+    highest = table + _clear_above(heightmap, x, y, action.theta, linkage.MIN_WIDTH_M)
     T_near[2, 3] = float(np.clip(highest + _NEAR_M, tcp_z, approach_z))
     T_start[2, 3] = tcp_z
     T_end[:3, 3] = (end_x, end_y, tcp_z)
@@ -233,18 +245,25 @@ def _plan_push(action: Action, heightmap: Heightmap, q_start: Array, config: Cel
     return MotionPlan("push", q_start, steps)
 
 
-def _highest_under_gripper(heightmap: Heightmap, x: float, y: float) -> float:
-    """The highest seen cell [m above the table] under the open gripper, turned any way; 0 if none was seen."""
+def _clear_above(heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float) -> float:
+    """Height [m above the table] above which nothing is expected under the gripper, turned by theta and so far open.
+
+    The highest cell that was seen there; where a cell is unknown, or lies outside the map, at least the tallest
+    object. Gaps between pixels are closed first.
+    """
     workspace = heightmap.workspace
-    radius = linkage.MAX_WIDTH_M / 2 + linkage.FINGER_THICKNESS_M
-    row, col = workspace.cell(x, y)
-    reach = math.ceil(radius / workspace.resolution_m)
+    half_x = opening_m / 2 + linkage.FINGER_THICKNESS_M + _AROUND_M
+    half_y = linkage.FINGER_BREADTH_M / 2 + _AROUND_M
+    steps = [np.arange(-half, half + workspace.resolution_m, workspace.resolution_m) for half in (half_x, half_y)]
+    u, v = np.meshgrid(*steps)
+    col = np.floor((x + u * math.cos(theta) - v * math.sin(theta) - workspace.x[0]) / workspace.resolution_m)
+    row = np.floor((y + u * math.sin(theta) + v * math.cos(theta) - workspace.y[0]) / workspace.resolution_m)
     rows, cols = workspace.shape
-    window = heightmap.height_m[
-        max(0, row - reach) : min(rows, row + reach + 1), max(0, col - reach) : min(cols, col + reach + 1)
-    ]
-    seen = window[np.isfinite(window)]
-    return max(0.0, float(seen.max())) if seen.size else 0.0
+    inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+    heights = close_gaps(heightmap.height_m)[row[inside].astype(np.intp), col[inside].astype(np.intp)]
+    seen = heights[np.isfinite(heights)]
+    highest = max(0.0, float(seen.max())) if seen.size else 0.0
+    return highest if inside.all() and seen.size == heights.size else max(highest, TALLEST_OBJECT_M)
 
 
 def _solve(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
@@ -268,7 +287,3 @@ def _linear(label: str, T_base_tcp: Array, config: CellConfig) -> LinearMove:
 
 def _home(config: CellConfig) -> JointMove:
     return _joint("home", np.array(config.motion.home_q), config)
-
-
-def _clamp(x: float, y: float, x_range: tuple[float, float], y_range: tuple[float, float]) -> tuple[float, float]:
-    return min(max(x, x_range[0]), x_range[1]), min(max(y, y_range[0]), y_range[1])

@@ -1,25 +1,27 @@
 """The layer between every decision and every motion.
 
-`check_plan` refuses a whole plan before anything moves; a `Guard` watches the arm while it moves. A violation
-latches: until an operator asks for `recover`, nothing moves. This layer adds to the safety settings of the
-controller and never replaces them.
+`check_config` refuses a cell that cannot work, `check_plan` refuses a whole plan before anything moves, and a `Guard`
+watches the arm while it moves. A violation latches: until an operator asks for `recover`, nothing moves. This layer
+adds to the safety settings of the controller and never replaces them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from robotcell import collision, kinematics, linkage
-from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
-from robotcell.geometry import Array, interpolate_transforms, rotation_angle
+from robotcell.errors import ConfigError, DeviceFault, GuardTripped, UnsafeMotion
+from robotcell.geometry import Array, check_transform, interpolate_transforms, rotation_angle
 from robotcell.interfaces import ArmMode, ArmState
-from robotcell.primitives import CheckHold, Grip, JointMove, LinearMove, MotionPlan, flange_pose
+from robotcell.primitives import CheckHold, Grip, JointMove, LinearMove, MotionPlan, flange_pose, tool_down
 
 if TYPE_CHECKING:
+    from robotcell.cell import Latch
     from robotcell.config import CellConfig, KeepOut
 
 # Distance between the samples of a checked path. A joint step of 0.04 rad moves the outstretched tcp by 40 mm.
@@ -32,6 +34,13 @@ _MAX_JOINT_JUMP_RAD = 0.35
 _START_TOLERANCE_RAD = 0.02
 # Rounding of positions that lie on a limit.
 _ROUNDING_M = 1e-6
+# Measured speeds scatter about the commanded ones; a measured tcp overshoots its box by rounding and control error.
+_SPEED_SLACK = 1.05
+_BOX_SLACK_M = 0.005
+# A time stamp may be ahead of the clock by what two clocks of one machine can differ.
+_CLOCK_SLACK_S = 0.01
+# The base and the turning shoulder stand on the table, or in it where the table is higher than the arm's base.
+_STANDS_ON_TABLE = 2
 
 
 @dataclass(frozen=True)
@@ -39,6 +48,54 @@ class CheckedPlan:
     """A plan that `check_plan` found safe; the only thing that the executor accepts."""
 
     plan: MotionPlan
+
+
+def check_config(config: CellConfig) -> None:
+    """Check that the parts of a configuration fit each other.
+
+    Raises:
+        ConfigError: naming everything that does not: speeds over their limits, a home pose that is unsafe or in the
+            view of the camera, a workspace or a bin that the arm may not or cannot reach.
+    """
+    problems: list[str] = []
+    motion, limits = config.motion, config.limits
+    if motion.joint_speed_rad_s > limits.joint_speed_rad_s:
+        problems.append(
+            f"motion.joint_speed_rad_s = {motion.joint_speed_rad_s}: above limits.joint_speed_rad_s = "
+            f"{limits.joint_speed_rad_s}"
+        )
+    for name in ("linear_speed_m_s", "guarded_speed_m_s"):
+        if getattr(motion, name) > limits.tool_speed_m_s:
+            problems.append(
+                f"motion.{name} = {getattr(motion, name)}: above limits.tool_speed_m_s = {limits.tool_speed_m_s}"
+            )
+    home = np.array(motion.home_q)
+    try:
+        _check_path(home[None], 0.0, collision.obstacles(config), config, "motion.home_q")
+    except UnsafeMotion as error:
+        problems.append(str(error))
+    if collision.blocks_view(home, config):
+        problems.append("motion.home_q: the arm would stand between the camera and the workspace")
+    z = config.table.height_m + motion.approach_m
+    corners = {f"workspace, corner x {x}, y {y}": (x, y) for x, y in product(config.workspace.x, config.workspace.y)}
+    for name, (x, y) in {**corners, "bin.center": config.bin.center}.items():
+        if _outside_box(np.array([[x, y, z]]), config, _ROUNDING_M)[0]:
+            problems.append(f"{name}: {1000 * motion.approach_m:.0f} mm above it the tcp would leave its limits")
+            continue
+        q = kinematics.inverse(flange_pose(tool_down(x, y, z, 0.0)), home)
+        if q is None:
+            problems.append(f"{name}: out of the arm's reach with the tool down")
+            continue
+        if motion.joint_speed_rad_s > limits.joint_speed_rad_s:
+            continue
+        way = JointMove(name, q, motion.joint_speed_rad_s, motion.joint_acceleration_rad_s2)
+        try:
+            _joint_path(home, way, config, f"the way from motion.home_q to {name}")
+        except UnsafeMotion as error:
+            problems.append(str(error))
+    if problems:
+        heading = f"the configuration does not fit together: {len(problems)} problem(s)"
+        raise ConfigError("\n  ".join([heading, *problems]))
 
 
 def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
@@ -58,19 +115,9 @@ def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
         if isinstance(step, Grip):
             _check_grip(step, name)
         elif isinstance(step, JointMove):
-            goal = _joint_vector(step.q, name)
-            _check_below(step.speed_rad_s, config.limits.joint_speed_rad_s, "joint speed", "rad/s", name)
-            _check_below(
-                step.acceleration_rad_s2,
-                kinematics.MAX_JOINT_ACCELERATION,
-                "joint acceleration",
-                "rad/s2",
-                name,
-            )
-            count = int(np.ceil(np.abs(goal - q).max() / _JOINT_STEP_RAD)) + 1
-            path = q + np.linspace(0.0, 1.0, max(count, 2))[:, None] * (goal - q)
+            path = _joint_path(q, step, config, name)
             _check_path(path[1:], step.load_m, obstacles, config, name)
-            q = goal
+            q = path[-1]
         elif isinstance(step, LinearMove):
             path = _linear_path(q, step, config, name)
             _check_path(path[1:], step.load_m, obstacles, config, name)
@@ -81,34 +128,24 @@ def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
 
 
 class Guard:
-    """Watches the arm while it moves, and remembers a violation until an operator clears it."""
+    """Watches the arm while it moves; what it finds is latched in the cell."""
 
-    def __init__(self, config: CellConfig) -> None:
+    def __init__(self, config: CellConfig, latch: Latch) -> None:
         self._config = config
-        self._violation: str | None = None
+        self._latch = latch
 
-    @property
-    def violation(self) -> str | None:
-        """What tripped the guard, or None."""
-        return self._violation
-
-    def check_clear(self) -> None:
-        """Raise GuardTripped if a violation is latched."""
-        if self._violation:
-            raise GuardTripped(f"nothing moves after a safety stop ({self._violation}); look at the cell, then recover")
-
-    def check_start(self, state: ArmState, plan: MotionPlan) -> None:
-        """Before a plan runs: nothing latched, the arm ready, and standing where the plan starts.
+    def check_start(self, state: ArmState, now: float, plan: MotionPlan) -> None:
+        """Before a plan runs: nothing latched, the arm within its limits, and standing where the plan starts.
 
         Raises:
-            GuardTripped: a violation is latched.
+            GuardTripped: a violation is latched, or the arm's state is stale or beyond a limit.
             DeviceFault: the arm is not ready.
             UnsafeMotion: the arm stands elsewhere.
         """
-        self.check_clear()
-        _check_ready(state)
+        self._latch.check()
+        self._check_state(state, now)
         off = float(np.abs(state.q - plan.q_start).max())
-        if off > _START_TOLERANCE_RAD:
+        if not off <= _START_TOLERANCE_RAD:
             raise UnsafeMotion(
                 f"{plan.label}: a joint is {off:.3f} rad from the start of the plan: plan again from measured joints"
             )
@@ -120,49 +157,43 @@ class Guard:
             GuardTripped: a limit is exceeded or the state is stale; latched.
             DeviceFault: the controller stopped the arm; latched.
         """
-        limits = self._config.limits
         try:
-            _check_ready(state)
-        except DeviceFault as fault:
-            self.trip(str(fault))
+            self._check_state(state, now)
+            x, y, z = state.T_base_tcp[:3, 3]
+            if _outside_box(state.T_base_tcp[None, :3, 3], self._config, _BOX_SLACK_M)[0]:
+                raise _tripped(f"the tcp at x {x:.3f}, y {y:.3f}, z {z:.3f} m left its box")
+        except (DeviceFault, GuardTripped) as error:
+            self._latch.trip(str(error))
             raise
+
+    def _check_state(self, state: ArmState, now: float) -> None:
+        """Freshness, mode, force and speeds; a number that is not one fails every comparison."""
+        limits = self._config.limits
+        if state.mode is not ArmMode.READY:
+            raise DeviceFault(f"the arm is in {state.mode.value}; clear the cause at the cell, then recover")
         age = now - state.t
-        x, y, z = state.T_base_tcp[:3, 3]
+        if not -_CLOCK_SLACK_S <= age <= limits.state_age_s:
+            raise _tripped(f"the arm's state is {age:.2f} s old (limit {limits.state_age_s} s)")
+        if not (np.isfinite(state.q).all() and np.isfinite(state.T_base_tcp).all()):
+            raise _tripped("the arm reports a position that is not a number")
         force = float(np.linalg.norm(state.wrench[:3]))
         joint_speed = float(np.abs(state.qd).max())
-        tool_speed = float(np.linalg.norm((kinematics.jacobian(state.q) @ state.qd)[:3]))
-        for exceeded, what in (
-            (age > limits.state_age_s, f"the arm's state is {age:.2f} s old (limit {limits.state_age_s} s)"),
-            (force > limits.force_n, f"the tool feels {force:.0f} N (limit {limits.force_n:.0f} N)"),
+        tool_speed = float(kinematics.tool_speed(state.q, state.qd, linkage.CLOSED_LENGTH_M))
+        for value, limit, what in (
+            (force, limits.force_n, "the tool feels {:.0f} N (limit {:.0f} N)"),
             (
-                joint_speed > 1.05 * limits.joint_speed_rad_s,
-                f"a joint turns at {joint_speed:.2f} rad/s (limit {limits.joint_speed_rad_s} rad/s)",
+                joint_speed,
+                _SPEED_SLACK * limits.joint_speed_rad_s,
+                "a joint turns at {:.2f} rad/s (limit {:.2f} rad/s)",
             ),
-            (
-                tool_speed > 1.05 * limits.tool_speed_m_s,
-                f"the tool moves at {tool_speed:.2f} m/s (limit {limits.tool_speed_m_s} m/s)",
-            ),
-            (
-                bool(_outside_box(state.T_base_tcp[None, :3, 3], self._config, slack_m=0.005)[0]),
-                f"the tcp at x {x:.3f}, y {y:.3f}, z {z:.3f} m left its box",
-            ),
+            (tool_speed, _SPEED_SLACK * limits.tool_speed_m_s, "the tool moves at {:.2f} m/s (limit {:.2f} m/s)"),
         ):
-            if exceeded:
-                self.trip(what)
-                raise GuardTripped(f"{what}; the arm was stopped: look at the cell, then recover")
-
-    def trip(self, what: str) -> None:
-        """Latch a violation."""
-        self._violation = what
-
-    def clear(self) -> None:
-        """Forget the violation. Only ever called because an operator asked for it."""
-        self._violation = None
+            if not value <= limit:
+                raise _tripped(what.format(value, limit))
 
 
-def _check_ready(state: ArmState) -> None:
-    if state.mode is not ArmMode.READY:
-        raise DeviceFault(f"the arm is in {state.mode.value}; clear the cause at the cell, then recover")
+def _tripped(what: str) -> GuardTripped:
+    return GuardTripped(f"{what}; the arm is stopped: look at the cell, then recover")
 
 
 def _check_grip(step: Grip, name: str) -> None:
@@ -181,37 +212,64 @@ def _joint_vector(q: Array, name: str) -> Array:
 
 def _check_below(value: float, limit: float, what: str, unit: str, name: str) -> None:
     if not 0 < value <= limit:
-        raise UnsafeMotion(f"{name}: {what} {value} {unit} is not within 0 and the limit of {limit} {unit}")
+        raise UnsafeMotion(f"{name}: {what} {value:.4g} {unit} is not within 0 and the limit of {limit:.4g} {unit}")
+
+
+def _joint_path(q: Array, step: JointMove, config: CellConfig, name: str) -> Array:
+    """Joint angles (N, 6) along a joint-space motion."""
+    goal = _joint_vector(step.q, name)
+    limits = config.limits
+    _check_below(step.speed_rad_s, limits.joint_speed_rad_s, "joint speed", "rad/s", name)
+    _check_below(step.acceleration_rad_s2, kinematics.MAX_JOINT_ACCELERATION, "joint acceleration", "rad/s2", name)
+    way = float(np.abs(goal - q).max())
+    count = max(int(np.ceil(way / _JOINT_STEP_RAD)) + 1, 2)
+    path = q + np.linspace(0.0, 1.0, count)[:, None] * (goal - q)
+    if way > 0:
+        # A short motion never reaches its speed.
+        peak = min(step.speed_rad_s, float(np.sqrt(step.acceleration_rad_s2 * way)))
+        tool_speed = kinematics.tool_speed(path, (goal - q) / way * peak, linkage.CLOSED_LENGTH_M).max()
+        if tool_speed > limits.tool_speed_m_s:
+            raise UnsafeMotion(
+                f"{name}: the tool would move at {tool_speed:.2f} m/s (limits.tool_speed_m_s = "
+                f"{limits.tool_speed_m_s}); lower motion.joint_speed_rad_s"
+            )
+    return path
 
 
 def _linear_path(q: Array, step: LinearMove, config: CellConfig, name: str) -> Array:
     """Joint angles (N, 6) along a straight motion; raises UnsafeMotion where the arm cannot follow."""
-    _check_below(step.speed_m_s, config.limits.tool_speed_m_s, "tool speed", "m/s", name)
+    limits = config.limits
+    _check_below(step.speed_m_s, limits.tool_speed_m_s, "tool speed", "m/s", name)
     _check_below(step.acceleration_m_s2, kinematics.MAX_TOOL_ACCELERATION, "tool acceleration", "m/s2", name)
-    T_goal = np.asarray(step.T_base_tcp)
-    if T_goal.shape != (4, 4) or not np.isfinite(T_goal).all():
-        raise UnsafeMotion(f"{name}: the target is not a finite 4x4 transform")
+    try:
+        T_goal = check_transform(step.T_base_tcp, "the target")
+    except ValueError as error:
+        raise UnsafeMotion(f"{name}: {error}") from error
     T_start = kinematics.forward(q) @ linkage.T_FLANGE_TCP
     length = float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3]))
     angle = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
-    count = int(np.ceil(max(length / _LINEAR_STEP_M, angle / _ROTATION_STEP_RAD))) + 1
-    T_path = interpolate_transforms(T_start, T_goal, np.linspace(0.0, 1.0, max(count, 2)))
+    count = max(int(np.ceil(max(length / _LINEAR_STEP_M, angle / _ROTATION_STEP_RAD))) + 1, 2)
+    T_path = interpolate_transforms(T_start, T_goal, np.linspace(0.0, 1.0, count))
     try:
         path = kinematics.inverse_along(flange_pose(T_path), q, _MAX_JOINT_JUMP_RAD)
     except ValueError as error:
         raise UnsafeMotion(f"{name}: {error}") from error
     distance = kinematics.distance_to_singularity(path)
-    if distance.min() < config.limits.singularity:
+    if distance.min() < limits.singularity:
         x, y, z = T_path[int(distance.argmin()), :3, 3]
         raise UnsafeMotion(
             f"{name}: too close to a singularity at tcp x {x:.3f}, y {y:.3f}, z {z:.3f} m "
-            f"({distance.min():.3f}, limit {config.limits.singularity})"
+            f"({distance.min():.3f}, limit {limits.singularity})"
         )
-    # How long the fastest joint needs, at the tool speed of the step.
+    # The time between samples at the speed of the step; a turn on the spot is as slow as the controller makes it.
     if length > 0:
         seconds = (length / (count - 1)) / step.speed_m_s
         joint_speed = float(np.abs(np.diff(path, axis=0)).max()) / seconds
-        _check_below(max(joint_speed, 1e-9), kinematics.MAX_JOINT_SPEED, "joint speed on the line", "rad/s", name)
+        if joint_speed > limits.joint_speed_rad_s:
+            raise UnsafeMotion(
+                f"{name}: a joint would turn at {joint_speed:.2f} rad/s on the line "
+                f"(limits.joint_speed_rad_s = {limits.joint_speed_rad_s}); go slower"
+            )
     return path
 
 
@@ -226,13 +284,6 @@ def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], conf
         )
     T_tcp = kinematics.forward(path) @ linkage.T_FLANGE_TCP
     tcp = T_tcp[:, :3, 3]
-    outside = _outside_box(tcp, config, slack_m=_ROUNDING_M)
-    if outside.any():
-        x, y, z = tcp[int(outside.argmax())]
-        raise UnsafeMotion(
-            f"{name}: the tcp would leave its box at x {x:.3f}, y {y:.3f}, z {z:.3f} m "
-            f"(limits x {limits.x}, y {limits.y}, z {limits.z} m)"
-        )
     too_low = tcp[:, 2] < table + config.gripper.tip_clearance_m - _ROUNDING_M
     if too_low.any():
         z = tcp[:, 2].min() - table
@@ -240,15 +291,21 @@ def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], conf
             f"{name}: the finger tips would be {1000 * z:.1f} mm above the table "
             f"(limit {1000 * config.gripper.tip_clearance_m:.1f} mm)"
         )
+    outside = _outside_box(tcp, config, slack_m=_ROUNDING_M)
+    if outside.any():
+        x, y, z = tcp[int(outside.argmax())]
+        raise UnsafeMotion(
+            f"{name}: the tcp would leave its box at x {x:.3f}, y {y:.3f}, z {z:.3f} m "
+            f"(limits x {limits.x}, y {limits.y}, z {limits.z} m above the table)"
+        )
     centers = collision.sphere_centers(path)
     radius = collision.SPHERES.radius + limits.clearance_m
-    # The base stands on the table.
-    above = collision.SPHERES.group > 0
+    above = collision.SPHERES.group >= _STANDS_ON_TABLE
     if (centers[:, above, 2] - radius[above] < table).any():
         raise UnsafeMotion(f"{name}: the arm or the gripper's body would touch the table")
     points = collision.finger_points(T_tcp, load_m)
     for box in obstacles:
-        body = (collision.box_distance(box, centers) < radius)[:, above]
+        body = (collision.box_distance(box, centers) < radius)[:, collision.SPHERES.group > 0]
         fingers = collision.box_distance(box, points) < limits.clearance_m
         if body.any() or fingers.any():
             raise UnsafeMotion(f"{name}: the arm, the gripper or its load would enter the keep-out {box.name!r}")
@@ -259,4 +316,5 @@ def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], conf
 def _outside_box(points: Array, config: CellConfig, slack_m: float) -> npt.NDArray[np.bool_]:
     limits = config.limits
     low, high = np.array([limits.x, limits.y, limits.z]).T
-    return np.asarray(((points < low - slack_m) | (points > high + slack_m)).any(axis=1))
+    relative = points - (0.0, 0.0, config.table.height_m)
+    return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))

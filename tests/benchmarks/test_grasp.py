@@ -14,7 +14,7 @@ from robotcell.decision import Action, Observation, Primitive
 from robotcell.executor import Executor
 from robotcell.jobs import View, look
 from robotcell.primitives import plan_action
-from robotcell.safety import CheckedPlan, Guard, check_plan
+from robotcell.safety import CheckedPlan, check_plan
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,7 +49,7 @@ class Bench:
         return check_plan(plan, self.cell.config)
 
     def run(self, checked: CheckedPlan) -> None:
-        Executor(self.cell, Guard(self.cell.config)).run(checked)
+        Executor(self.cell).run(checked)
 
     def whole(self) -> None:
         view = self.look()

@@ -103,7 +103,9 @@ def test_a_job_that_is_cut_off_is_on_record_as_stopped(cell: Path, number: signa
         process.send_signal(number)
         process.stderr.read()
         assert process.wait() == code
-    assert "stopped" in run("jobs", "show", "1", "--cell", cell).stdout
+    shown = run("jobs", "show", "1", "--cell", cell).stdout
+    assert "stopped" in shown
+    assert ("interrupted" if number is signal.SIGINT else "terminated") in shown
 
 
 def test_a_dry_run_draws_and_moves_nothing(cell: Path, tmp_path: Path) -> None:
@@ -116,6 +118,7 @@ def test_a_dry_run_draws_and_moves_nothing(cell: Path, tmp_path: Path) -> None:
 
 def test_jobs_are_listed_and_shown(cell: Path) -> None:
     assert "no jobs yet" in run("jobs", "--cell", cell).stdout
+    assert not (cell.parent / "runs").exists()
     picked = run("pick", "--goal", "blue", "--cell", cell)
     assert picked.exit_code == 0, picked.output
     listing = run("jobs", "--cell", cell)
@@ -146,12 +149,39 @@ def test_a_refusal_says_why(cell: Path, arguments: tuple[str, ...], code: int, m
     assert message in result.stderr
 
 
-def test_a_refusal_is_json_too(cell: Path) -> None:
-    result = run("pick", "--cell", cell, "--goal", "green", "--json")
+def test_what_was_done_before_a_refusal_is_in_the_json(cell: Path) -> None:
+    result = run("pick", "--cell", cell, "--goal", "red,green", "--json")
     assert result.exit_code == 1
     summary = json.loads(result.stdout)
     assert summary["completed"] is False
-    assert "no green object" in summary["error"]
+    assert "no green object" in summary["reason"]
+    assert summary["picked_objects"] == ["red"]
+    assert (Path(summary["run_dir"]) / "summary.gif").is_file()
+
+
+def test_a_job_that_never_started_has_the_same_keys_in_json(cell: Path) -> None:
+    refused = json.loads(run("pick", "--cell", cell, "--goal", "mauve", "--json").stdout)
+    done = json.loads(run("pick", "--cell", cell, "--goal", "red", "--json").stdout)
+    assert refused.keys() == done.keys()
+    assert refused["job"] is None
+
+
+def test_a_folder_that_cannot_be_made_is_a_wrong_setting(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text('[journal]\nruns = "/dev/null/runs"\n')
+    for arguments in (("--dry-run",), ()):
+        result = run("pick", "--goal", "red", "--cell", path, *arguments)
+        assert result.exit_code == 2, result.output
+        assert "/dev/null/runs" in result.stderr
+
+
+def test_brackets_in_a_path_are_printed_as_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "cell.toml"
+    path.write_text(f'[journal]\nruns = "{tmp_path}/r[bold]x"\n[backend.options]\nobjects = 1\n')
+    result = run("pick", "--all", "--cell", path)
+    assert result.exit_code == 0, result.output
+    assert "r[bold]x" in result.stdout
+    assert "[m]" in run("jobs", "show", "1", "--cell", path).stdout
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import math
+import sqlite3
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
 
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, DeviceFault
 from robotcell.journal import ActionRow, Frame, Journal, OutcomeRow
 
 if TYPE_CHECKING:
@@ -111,3 +114,30 @@ def test_an_unknown_job_says_which_exist(tmp_path: Path) -> None:
 def test_a_journal_that_cannot_be_opened_says_so(url: str) -> None:
     with pytest.raises(ConfigError, match=r"journal\.url = .*cannot be opened"):
         Journal(url)
+
+
+def test_a_password_is_not_shown() -> None:
+    with pytest.raises(ConfigError) as caught:
+        Journal("postgresql://cell:secret@nowhere.invalid/journal")
+    assert "secret" not in str(caught.value)
+
+
+def test_a_foreign_database_is_an_error_of_the_setting(tmp_path: Path) -> None:
+    connection = sqlite3.connect(tmp_path / "other.db")
+    connection.execute("CREATE TABLE jobs (id INTEGER PRIMARY KEY, title TEXT)")
+    connection.close()
+    with Journal(f"sqlite:///{tmp_path}/other.db") as journal:
+        with pytest.raises(ConfigError, match="cannot be read"):
+            journal.jobs()
+        with pytest.raises(DeviceFault, match="cannot be written"):
+            journal.start_job(None, "heuristic", {}, tmp_path)
+
+
+def test_two_processes_may_open_a_new_journal_at_once(tmp_path: Path) -> None:
+    code = f"from robotcell.journal import Journal\nJournal('sqlite:///{tmp_path}/journal.db').close()"
+    with (
+        subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as first,
+        subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True) as second,
+    ):
+        errors = first.communicate()[1] + second.communicate()[1]
+    assert errors == ""

@@ -11,7 +11,7 @@ from robotcell import kinematics, linkage
 from robotcell.config import CellConfig
 from robotcell.decision import Primitive
 from robotcell.errors import UnsafeMotion
-from robotcell.primitives import LOAD_REACH_M, Grip, JointMove, LinearMove, MotionPlan, plan_action
+from robotcell.primitives import LOAD_REACH_M, TALLEST_OBJECT_M, Grip, JointMove, LinearMove, MotionPlan, plan_action
 from tests.robotcell.maps import action, heightmap
 
 CONFIG = CellConfig()
@@ -51,10 +51,19 @@ def test_a_grasp_lifts_straight_up_until_the_load_clears_the_bin(x: float, y: fl
 def test_the_unguarded_descent_ends_above_what_stands_there() -> None:
     heights = np.zeros(CONFIG.workspace.shape, np.float32)
     x, y = CONFIG.workspace.position(112, 112)
-    heights[100:104, 110:114] = 0.08  # a neighbour under the open gripper
+    heights[110:114, 132:136] = 0.08  # a neighbour under one of the open fingers
     plan = plan_action(action(Primitive.GRASP, x, y, 0.05, 0), heightmap(heights), HOME, CONFIG)
     tips = linear(plan, "descend").T_base_tcp[2, 3] + linkage.tip_retraction(CONFIG.gripper.preshape_m)
     assert tips == pytest.approx(0.08 + 0.015, abs=1e-3)
+
+
+@pytest.mark.parametrize("primitive", Primitive)
+def test_what_was_not_seen_may_be_as_tall_as_the_tallest_object(primitive: Primitive) -> None:
+    unseen = heightmap(np.full(CONFIG.workspace.shape, np.nan, np.float32))
+    plan = plan_action(action(primitive, -0.5, 0.0, 0.05, 3), unseen, HOME, CONFIG)
+    opening = CONFIG.gripper.preshape_m if primitive is Primitive.GRASP else 0.0
+    tips = linear(plan, "descend").T_base_tcp[2, 3] + linkage.tip_retraction(opening)
+    assert tips >= TALLEST_OBJECT_M
 
 
 @given(xs, ys, rotations)
@@ -67,7 +76,10 @@ def test_a_push_goes_straight_and_stays_in_the_workspace(x: float, y: float, rot
     start, end = linear(plan, "descend guarded").T_base_tcp, linear(plan, "push").T_base_tcp
     assert start[2, 3] == end[2, 3] == pytest.approx(0.025, abs=1e-6)
     travel = end[:2, 3] - start[:2, 3]
-    assert np.linalg.norm(travel) <= CONFIG.motion.push_m + 1e-6
+    length = np.linalg.norm(travel)
+    assert length <= CONFIG.motion.push_m + 1e-6
+    theta = 2 * math.pi * rotation / 16
+    np.testing.assert_allclose(travel / length, (math.cos(theta), math.sin(theta)), atol=1e-4)
     for T in (start, end):
         assert CONFIG.workspace.x[0] - 1e-6 <= T[0, 3] <= CONFIG.workspace.x[1] + 1e-6
         assert CONFIG.workspace.y[0] - 1e-6 <= T[1, 3] <= CONFIG.workspace.y[1] + 1e-6

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robotcell import kinematics, linkage
+from robotcell.cell import Latch
 from robotcell.config import CellConfig
 from robotcell.decision import Primitive
-from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
+from robotcell.errors import ConfigError, DeviceFault, GuardTripped, UnsafeMotion
 from robotcell.interfaces import ArmMode, ArmState
 from robotcell.primitives import (
     Grip,
@@ -22,7 +23,7 @@ from robotcell.primitives import (
     plan_retreat,
     tool_down,
 )
-from robotcell.safety import Guard, check_plan
+from robotcell.safety import Guard, check_config, check_plan
 from tests.robotcell.maps import action, heightmap
 
 CONFIG = CellConfig()
@@ -95,10 +96,10 @@ def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z
         (joint_move([*HOME[:5], 6.27]), r"joint 5 would turn to 6\.27 rad"),
         (joint_move(HOME, speed=2.5), "joint speed 2.5 rad/s"),
         (joint_move(HOME, acceleration=100.0), "joint acceleration 100"),
-        (joint_move(HOME, speed=0.0), "joint speed 0.0"),
+        (joint_move(HOME, speed=0.0), "joint speed 0 "),
         (Grip("grip", 0.12, 20.0), r"width 120\.0 mm"),
         (Grip("grip", 0.05, 50.0), r"force 50\.0 N"),
-        (LinearMove("line", np.full((4, 4), np.nan), 0.1, 1.0), "not a finite 4x4"),
+        (LinearMove("line", np.full((4, 4), np.nan), 0.1, 1.0), "NaN"),
     ],
 )
 def test_a_step_outside_the_limits_is_refused(step: Any, reason: str) -> None:
@@ -189,33 +190,115 @@ def test_a_retreat_from_too_low_is_safe_and_a_move_along_there_is_not() -> None:
 
 
 def test_a_plan_starts_where_the_arm_stands() -> None:
-    guard = Guard(CONFIG)
-    guard.check_start(state(), plan_of())
+    guard = Guard(CONFIG, Latch())
+    guard.check_start(state(), 0.0, plan_of())
     with pytest.raises(UnsafeMotion, match="plan again from measured joints"):
-        guard.check_start(state(q=HOME + 0.1), plan_of())
+        guard.check_start(state(q=HOME + 0.1), 0.0, plan_of())
     with pytest.raises(DeviceFault, match="emergency stop"):
-        guard.check_start(state(mode=ArmMode.EMERGENCY_STOP), plan_of())
+        guard.check_start(state(mode=ArmMode.EMERGENCY_STOP), 0.0, plan_of())
+    with pytest.raises(GuardTripped, match="old"):
+        guard.check_start(state(), 100.0, plan_of())
+    with pytest.raises(GuardTripped, match="not a number"):
+        guard.check_start(state(q=np.full(6, np.nan)), 0.0, plan_of())
 
 
 @pytest.mark.parametrize(
     ("changes", "now", "error", "reason"),
     [
         ({}, 0.3, GuardTripped, r"0\.30 s old"),
+        ({"t": 1000.0}, 0.0, GuardTripped, "old"),
+        ({"t": float("nan")}, 0.0, GuardTripped, "old"),
         ({"wrench": np.array([0.0, 0.0, 120.0, 0, 0, 0])}, 0.0, GuardTripped, "120 N"),
+        ({"wrench": np.full(6, np.nan)}, 0.0, GuardTripped, "feels nan"),
         ({"qd": np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.5])}, 0.0, GuardTripped, r"2\.50 rad/s"),
-        ({"qd": np.array([2.0, 2.0, 0.0, 0.0, 0.0, 0.0])}, 0.0, GuardTripped, "tool moves at"),
+        ({"qd": np.full(6, np.nan)}, 0.0, GuardTripped, "turns at nan"),
+        ({"qd": np.array([2.0, 2.0, 2.0, 2.0, 0.0, 0.0])}, 0.0, GuardTripped, "tool moves at"),
         ({"T_base_tcp": tool_down(-0.9, 0.0, 0.3, 0.0)}, 0.0, GuardTripped, "left its box"),
+        ({"T_base_tcp": np.full((4, 4), np.nan)}, 0.0, GuardTripped, "not a number"),
         ({"mode": ArmMode.PROTECTIVE_STOP}, 0.0, DeviceFault, "protective stop"),
     ],
 )
 def test_a_violation_latches_until_an_operator_clears_it(
     changes: dict[str, Any], now: float, error: type[Exception], reason: str
 ) -> None:
-    guard = Guard(CONFIG)
+    latch = Latch()
+    guard = Guard(CONFIG, latch)
     guard.check(state(), 0.0)
     with pytest.raises(error, match=reason):
         guard.check(state(**changes), now)
     with pytest.raises(GuardTripped, match="recover"):
-        guard.check_start(state(), plan_of())
-    guard.clear()
-    guard.check_start(state(), plan_of())
+        Guard(CONFIG, latch).check_start(state(), 0.0, plan_of())
+    latch.clear()
+    guard.check_start(state(), 0.0, plan_of())
+
+
+def test_the_tool_is_judged_by_the_speed_of_its_tip() -> None:
+    # The second wrist joint moves the tip, not the flange's middle, through most of its way.
+    slow = CellConfig.model_validate({"limits": {"tool_speed_m_s": 0.5}})
+    wrist = np.array([0.0, 0.0, 0.0, 0.0, 2.0, 0.0])
+    with pytest.raises(GuardTripped, match=r"tool moves at 0\.6"):
+        Guard(slow, Latch()).check(state(qd=wrist), 0.0)
+
+
+def test_a_joint_move_that_would_sweep_the_tool_too_fast_is_refused() -> None:
+    slow = CellConfig.model_validate({"limits": {"tool_speed_m_s": 0.25}})
+    with pytest.raises(UnsafeMotion, match=r"the tool would move at .* lower motion\.joint_speed_rad_s"):
+        check_plan(plan_of(above(-0.5, 0.0, 0.3)), slow)
+
+
+def test_a_line_that_would_turn_a_joint_too_fast_is_refused() -> None:
+    slow = CellConfig.model_validate({"limits": {"joint_speed_rad_s": 0.3}, "motion": {"joint_speed_rad_s": 0.3}})
+    start = replace(above(-0.3, 0.0, 0.3), speed_rad_s=0.3)
+    with pytest.raises(UnsafeMotion, match="a joint would turn at"):
+        check_plan(plan_of(start, to(-0.3, 0.2, 0.3, speed=0.25)), slow)
+
+
+@pytest.mark.parametrize("T", [np.zeros((4, 4)), np.diag([2.0, 1.0, 1.0, 1.0])])
+def test_a_target_that_is_no_pose_is_refused(T: np.ndarray) -> None:
+    with pytest.raises(UnsafeMotion, match="the target"):
+        check_plan(plan_of(LinearMove("line", T, 0.1, 1.0)), CONFIG)
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        {"x": (-0.475, -0.452), "y": (-0.02, 0.02), "z": (0.0, 0.03)},
+        {"x": (-0.49, -0.445), "y": (-0.06, 0.06), "z": (0.0, 0.03)},
+        {"x": (-0.52, -0.51), "y": (-0.005, 0.005), "z": (0.0, 0.06)},
+    ],
+)
+def test_no_finger_passes_through_a_small_keep_out(box: dict[str, Any]) -> None:
+    config = CellConfig.model_validate({"keep_out": [{"name": "pin", **box}]})
+    plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
+    with pytest.raises(UnsafeMotion, match="keep-out 'pin'"):
+        check_plan(plan, config)
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"motion": {"joint_speed_rad_s": 3.0}}, r"motion\.joint_speed_rad_s = 3\.0: above limits"),
+        ({"motion": {"linear_speed_m_s": 0.9}, "limits": {"tool_speed_m_s": 0.8}}, r"motion\.linear_speed_m_s"),
+        ({"motion": {"home_q": [100, 0, 0, 0, 0, 0]}}, r"motion\.home_q: joint 0 would turn to 100"),
+        ({"motion": {"home_q": [-0.8370, -1.4768, 1.9, -1.3733, -1.5708, 0.7338]}}, "between the camera and the"),
+        ({"workspace": {"x": (-2.0, -1.6)}}, r"workspace, corner x -2\.0.* leave its limits"),
+        (
+            {"bin": {"center": (0.9, 0.5)}, "limits": {"x": (-1, 1), "y": (-1, 1)}},
+            r"bin\.center: out of the arm's reach",
+        ),
+        ({"keep_out": [{"name": "lamp", "x": (-1, 1), "y": (-1, 1), "z": (0.2, 0.4)}]}, "keep-out 'lamp'"),
+    ],
+)
+def test_settings_that_do_not_fit_together_are_refused(settings: dict[str, Any], problem: str) -> None:
+    config = CellConfig.model_validate(settings)
+    with pytest.raises(ConfigError, match=problem):
+        check_config(config)
+
+
+@pytest.mark.parametrize("height", [-0.1, 0.0, 0.05])
+def test_a_table_at_another_height_is_as_good(height: float) -> None:
+    config = CellConfig.model_validate({"table": {"height_m": height}})
+    check_config(config)
+    for rotation in (0, 5):
+        plan = plan_action(action(Primitive.GRASP, -0.6, 0.1, height + 0.05, rotation), heightmap(), HOME, config)
+        check_plan(plan, config)
