@@ -4,7 +4,7 @@ import pytest
 
 from robotcell.config import CameraMount, load_config
 from robotcell.errors import ConfigError, ConnectionLost
-from robotcell.geometry import look_at, transform_points
+from robotcell.geometry import invert_transform, look_at, transform_points
 from sim_twin.backend import TwinOptions
 from sim_twin.camera import TwinCamera
 from sim_twin.noise import WARM_UP_FRAMES, NoiseOptions
@@ -134,7 +134,7 @@ def test_in_the_twin_things_are_seen_where_the_world_has_them(resolution):
     world = World(config, TwinOptions(seed=4))
     with TwinCamera(world, config.camera, NoiseOptions(), 4) as camera:
         frame = camera.read()
-        _, visual = camera.render_truth()
+        depth, visual = camera.render_truth()
         seen, objects = world.visuals(), world.objects()
     rays = ray_directions(frame.intrinsics)
     points = transform_points(config.camera.pose(), rays * frame.depth_m[..., None])
@@ -147,11 +147,24 @@ def test_in_the_twin_things_are_seen_where_the_world_has_them(resolution):
     assert abs(heights.mean()) < 0.0005
     assert heights.std() < 0.0025
     assert measured[workspace & table & ~edge].mean() > 0.98
-    for index, (_, T_base_object) in enumerate(objects):
-        pixels = np.isin(visual, [k for k, v in enumerate(seen) if v.object_index == index]) & measured
-        if pixels.sum() > 100:
-            offset = np.median(points[pixels], axis=0) - T_base_object[:3, 3]
-            assert np.linalg.norm(offset) < 0.06
+    optics = frame.intrinsics
+    v, u = np.indices(depth.shape)
+    in_camera = np.stack([(u - optics.cx) / optics.fx, (v - optics.cy) / optics.fy, np.ones_like(u)], axis=2)
+    exact = transform_points(config.camera.pose(), in_camera * depth[..., None])
+    checked = 0
+    for index, (item, T_base_object) in enumerate(objects):
+        pixels = np.isin(visual, [k for k, v in enumerate(seen) if v.object_index == index])
+        corners = item.shape.mesh.vertices[item.shape.mesh.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        surface = transform_points(invert_transform(T_base_object), exact[pixels])
+        # Every pixel of an object lies in a plane of its faces, and not outside its bounding box.
+        heights = surface @ normals.T - np.einsum("mi,mi->m", normals, corners[:, 0])
+        low, high = item.shape.mesh.vertices.min(axis=0), item.shape.mesh.vertices.max(axis=0)
+        assert (np.abs(heights).min(axis=1) < 0.002).all()
+        assert ((surface > low - 0.002) & (surface < high + 0.002)).all()
+        checked += len(surface)
+    assert checked > 1000
 
 
 def test_a_world_that_cannot_be_built_leaves_nothing_attached():
