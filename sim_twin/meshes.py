@@ -34,8 +34,11 @@ _SAMPLES = 3000
 # of quasirandom sequences", 2018).
 _LATTICE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
 # Corners this close to a cutting plane are in it.
-_SNAP_M = 1e-9
-_NUDGE = np.array([1.0, 0.62, 0.38]) * 1e-5
+_SNAP_M = 1e-6
+_NUDGE = np.array([1.0, 0.62, 0.38]) * 1e-3
+# Normals with such a cosine are of parallel faces.
+_PARALLEL = 0.999
+_AXIS_CANDIDATES = 200
 # Pairs of points and triangles that are tested at once.
 _CHUNK = 500_000
 # Share of a surface that may be missing.
@@ -177,9 +180,9 @@ def hull(points: Array) -> Mesh:
 def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
     """Convex pieces that together cover a closed mesh: its hull, where that hardly differs from it.
 
-    A concave mesh is cut along planes across its axes, first where that frees most of what the hulls of the pieces
-    fill besides the mesh, until that is at most `CONCAVITY_TOLERANCE` of it or there are `_MAX_PARTS` pieces. What
-    is filled is counted on a lattice of sample points.
+    A concave mesh is cut across the directions of its largest flat sides, first where that frees most of what the
+    hulls of the pieces fill besides the mesh, until that is at most `CONCAVITY_TOLERANCE` of it or there are
+    `_MAX_PARTS` pieces. What is filled is counted on a lattice of sample points.
 
     Raises:
         ValueError: the mesh is flat.
@@ -187,9 +190,11 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
     whole = hull(mesh.vertices)
     if mesh_volume(whole) <= (1 + CONCAVITY_TOLERANCE) * mesh_volume(mesh):
         return (whole,)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    R = _flat_axes(mesh)
+    vertices = mesh.vertices @ R
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     samples = low + np.mod(np.outer(np.arange(1, _SAMPLES + 1), _LATTICE), 1) * (high - low)
-    solid = mesh.vertices[mesh.triangles]
+    solid = vertices[mesh.triangles]
     inside = _inside(solid, samples)
     body = _Body(solid, samples[inside], samples[~inside])
     pieces = [_piece(body, solid, low, high)]
@@ -197,7 +202,24 @@ def convex_parts(mesh: Mesh) -> tuple[Mesh, ...]:
         worst = max(pieces, key=lambda piece: piece.free)
         pieces.remove(worst)
         pieces += _halves(body, worst)
-    return tuple(hull(piece.corners) for piece in pieces)
+    return tuple(hull(piece.corners @ R.T) for piece in pieces)
+
+
+def _flat_axes(mesh: Mesh) -> Array:
+    """Orthonormal axes (3, 3), as columns: the normal of most of the surface, and of most of what is square to it."""
+    corners = mesh.vertices[mesh.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    normals = normals[areas > 0] / areas[areas > 0, None]
+    candidates = normals[np.argsort(-areas[areas > 0], kind="stable")[:_AXIS_CANDIDATES]]
+    weights = (np.abs(candidates @ normals.T) > _PARALLEL) @ areas[areas > 0]
+    x = candidates[np.argmax(weights)]
+    y = candidates[np.argmax(weights * (np.abs(candidates @ x) < 1 - _PARALLEL))]
+    # Where nothing is square to x, whatever direction is.
+    y = y if abs(y @ x) < 1 - _PARALLEL else np.linalg.svd(x[None])[2][1]
+    y = y - (y @ x) * x
+    y /= np.linalg.norm(y)
+    return np.column_stack([x, y, np.cross(x, y)])
 
 
 @dataclass(frozen=True)
@@ -256,7 +278,7 @@ def _halves(body: _Body, piece: _Piece) -> list[_Piece]:
     points = piece.triangles.reshape(-1, 3)
     for axis in range(3):
         low, high = piece.low[axis], piece.high[axis]
-        levels, counts = np.unique(points[:, axis].round(9), return_counts=True)
+        levels, counts = np.unique(points[:, axis].round(6), return_counts=True)
         # Steps of the surface are levels that many of its corners share.
         steps = levels[np.argsort(-counts, kind="stable")[:_CUTS_PER_AXIS]]
         for at in (*np.linspace(low, high, _CUTS_PER_AXIS + 2)[1:-1], *steps):
