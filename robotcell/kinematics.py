@@ -20,7 +20,7 @@ DH_D = np.array([0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996])
 DH_ALPHA = np.array([np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0])
 
 # Universal Robots, UR5e user manual: every joint turns by +-360 degrees at up to 180 degrees/s; the elbow, by the
-# arm's own links, by +-180. Acceleration and tool limits are the ranges that the RTDE control interface accepts.
+# arm's own links, by +-180. The maxima are the ranges that the RTDE control interface accepts.
 JOINT_LIMIT = np.array([2 * np.pi, 2 * np.pi, np.pi, 2 * np.pi, 2 * np.pi, 2 * np.pi])
 MAX_JOINT_SPEED = 3.14
 MAX_JOINT_ACCELERATION = 40.0

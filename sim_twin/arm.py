@@ -67,21 +67,25 @@ class TwinArm(Arm):
         """Attach to the world and hold the arm where it is. Does nothing when connected."""
         if self._connected:
             return
-        self._world.attach(self)
-        self._joints = self._world.joint_index(robot_model.ARM_JOINTS)
-        self._mode = ArmMode.READY
-        self._kicked_at = None
-        self._hold()
-        self._world.add_controller(self._control)
-        self._connected = True
+        try:
+            self._world.attach(self)
+            self._joints = self._world.joint_index(robot_model.ARM_JOINTS)
+            self._mode = ArmMode.READY
+            self._kicked_at = None
+            self._hold()
+            self._world.add_controller(self._control)
+            self._connected = True
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
-        """Stop the arm and let the world go. Idempotent."""
+        """Stop the arm and let the world go. Idempotent, also when connecting was cut short."""
         if self._connected:
             self._hold()
-            self._world.remove_controller(self._control)
-            self._connected = False
-            self._world.detach(self)
+        self._connected = False
+        self._world.remove_controller(self._control)
+        self._world.detach(self)
 
     @property
     def moving(self) -> bool:
@@ -200,12 +204,11 @@ class TwinArm(Arm):
             self._kicked_at = self._world.time_s
 
     def _control(self) -> None:
-        """One control period: watch, then command the next sample."""
-        if self._index >= len(self._path) - 1:
-            return
-        if self._must_protect():
+        """One control period: watch, also an arm at rest; then command the next sample."""
+        if self._mode is ArmMode.READY and self._must_protect():
             self._hold()
             self._mode = ArmMode.PROTECTIVE_STOP
+        if self._index >= len(self._path) - 1:
             return
         if self._kicked_at is not None and self._world.time_s - self._kicked_at > WATCHDOG_S:
             self.stop()

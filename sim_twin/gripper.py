@@ -51,19 +51,23 @@ class TwinGripper(Gripper):
         """Attach to the world and hold the fingers where they are. Does nothing when connected."""
         if self._connected:
             return
-        self._world.attach(self)
-        self._cranks = self._world.joint_index((robot_model.LEFT_CRANK, robot_model.RIGHT_CRANK))
-        self._connected = True
-        self.stop()
-        self._world.add_controller(self._control)
+        try:
+            self._world.attach(self)
+            self._cranks = self._world.joint_index((robot_model.LEFT_CRANK, robot_model.RIGHT_CRANK))
+            self._connected = True
+            self.stop()
+            self._world.add_controller(self._control)
+        except BaseException:
+            self.close()
+            raise
 
     def close(self) -> None:
-        """Stop the fingers and let the world go. Idempotent."""
+        """Stop the fingers and let the world go. Idempotent, also when connecting was cut short."""
         if self._connected:
             self.stop()
-            self._world.remove_controller(self._control)
-            self._connected = False
-            self._world.detach(self)
+        self._connected = False
+        self._world.remove_controller(self._control)
+        self._world.detach(self)
 
     def state(self) -> GripperState:
         """The state after the last step."""

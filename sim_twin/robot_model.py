@@ -43,11 +43,10 @@ JOINT_TORQUE_NM = (150.0, 150.0, 150.0, 28.0, 28.0, 28.0)
 RG2_MASS_KG = 0.78
 _CRANK_MASS_KG = 0.03
 _FINGER_MASS_KG = 0.03
-# The palm is 85 mm behind the closed tips (see robotcell.linkage); a crank's pivot is just behind it, 17 mm off the
-# middle, and its second, parallel crank further in (public RG2 models, rounded).
-PALM_M = linkage.CLOSED_LENGTH_M - 0.085
+# A crank's pivot is just behind the palm, 17 mm off the middle, and its second, parallel crank further in (public RG2
+# models, rounded).
 _PIVOT_X = 0.017
-_PIVOT_Z = PALM_M - 0.003
+_PIVOT_Z = linkage.PALM_M - 0.002
 _SECOND_PIVOT = (-0.009, 0.014)
 _KNUCKLE_TO_TIP = linkage.CLOSED_LENGTH_M - _PIVOT_Z - linkage.CRANK_LENGTH_M * math.cos(linkage.CLOSED_ANGLE)
 # From the knuckle to the inner face of the finger: closed, the two faces meet in the middle.
@@ -269,7 +268,7 @@ def _gripper_body() -> tuple[Part, ...]:
         _tube((0, 0, 0), (0, 0, 0.014), 0.036, _DARK),
         _block((-0.035, -0.024, 0.014), (0.035, 0.024, 0.088), _GREY),
         _block((-0.030, -0.0245, 0.040), (0.030, 0.0245, 0.052), _BLUE, collides=False),
-        _block((-0.030, -0.020, 0.088), (0.030, 0.020, PALM_M), _DARK),
+        _block((-0.030, -0.020, 0.088), (0.030, 0.020, linkage.PALM_M), _DARK),
     )
 
 

@@ -322,7 +322,8 @@ class World:
             # The scene comes to rest before the arm is there, so an object never falls onto it.
             self._load_scene(scene)
             for body in self._built.bodies:
-                self._put_to_sleep(body)
+                if self._at_rest(body):
+                    self._put_to_sleep(body)
             self._built.quiet = [0] * len(self._built.bodies)
             self._load_robot(table)
             self._make_visuals()
@@ -411,6 +412,7 @@ class World:
                 self._run(_DROP_STEPS)
         self._settle(scene)
         if not scene.drop:
+            self._check_on_table(scene)
             return
         rng = np.random.default_rng([self._options.seed, 0xD50])
         for _ in range(_DROP_TRIES):
@@ -489,12 +491,25 @@ class World:
         quiet = 0
         for _ in range(_SETTLE_SLICES):
             self._run(_SETTLE_SLICE)
-            # What rolled out of the workspace may roll on, or fall off the table; it is dropped again.
-            resting = all(self._at_rest(body) for body in built.bodies if self._in_workspace(body))
+            # What a drop scatters out of the workspace may roll on, or fall off the table; it is dropped again.
+            resting = all(self._at_rest(body) or (scene.drop and not self._in_workspace(body)) for body in built.bodies)
             quiet = quiet + 1 if resting else 0
             if quiet == _QUIET_SLICES:
                 return
+            if not scene.drop:
+                self._check_on_table(scene)
         raise ConfigError(f"scene {scene.name!r} does not come to rest: its objects overlap or keep rolling")
+
+    def _check_on_table(self, scene: Scene) -> None:
+        """Refuse a scene that puts objects where there is no table, or in it."""
+        built = self._need()
+        for item, body in zip(built.scene_objects, built.bodies, strict=True):
+            x, y, z = self._object_pose(body)[:3, 3]
+            if z < self.config.table.height_m:
+                raise ConfigError(
+                    f"scene {scene.name!r}: {item.name!r} fell off the table (x {x:.2f}, y {y:.2f} m): put it on the "
+                    "table, in metres"
+                )
 
     def _at_rest(self, body: int) -> bool:
         built = self._need()

@@ -7,17 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell import kinematics, linkage
-from robotcell.cell import Cell, open_cell
 from robotcell.config import load_config
 from robotcell.geometry import Array, make_transform
-from sim_twin import scenes
-from sim_twin.arm import TwinArm
-from sim_twin.gripper import TwinGripper
+from sim_twin import backend, scenes
 from sim_twin.shapes import block
 
 if TYPE_CHECKING:
     import pytest
 
+    from robotcell.cell import Cell
     from sim_twin.world import World
 
 PERIOD_S = 0.008
@@ -40,10 +38,7 @@ def with_block(
 
 def open_twin(**options: object) -> tuple[Cell, World]:
     """A twin, not yet connected, and its world."""
-    cell = open_cell(load_config(None, {f"backend.options.{key}": value for key, value in options.items()}))
-    assert isinstance(cell.arm, TwinArm)
-    assert isinstance(cell.gripper, TwinGripper)
-    return cell, cell.arm._world
+    return backend.open_twin(load_config(None, {f"backend.options.{key}": value for key, value in options.items()}))
 
 
 def tool_down(x: float, y: float, z: float, yaw: float = 0.0) -> Array:

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from robotcell import kinematics
-from robotcell.errors import DeviceFault, UnsafeMotion
+from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.interfaces import ArmMode
+from sim_twin import robot_model
 from sim_twin.arm import PROTECTIVE_FORCE_N
 from tests.sim_twin.cells import close_on, finish, go, joints_at, open_twin, tool_down, with_block
 
@@ -76,7 +77,7 @@ def test_a_motion_faster_than_the_motors_allow_ends_in_a_protective_stop(cell):
     cell.arm.start_joints(joints_at(tool_down(-0.65, 0.10, 0.35)), 1.5, 1.4)
     finish(cell)
     # Raising the stretched arm at 40 rad/s^2 takes more than the shoulder's 150 N m.
-    cell.arm.start_joints(cell.arm.state().q + np.array((0, -0.8, 0, 0, 0, 0)), np.pi, 40.0)
+    cell.arm.start_joints(cell.arm.state().q + np.array((0, -0.8, 0, 0, 0, 0)), 3.14, 40.0)
     finish(cell)
     assert cell.arm.state().mode is ArmMode.PROTECTIVE_STOP
 
@@ -112,3 +113,31 @@ def test_a_held_block_weighs_on_the_flange(monkeypatch):
         weight = shape.density_kg_m3 * shape.volume_m3 * 9.81
         np.testing.assert_allclose(np.mean(forces, axis=0), (0, 0, -weight), atol=0.05)
         assert world.objects()[0][1][2, 3] > 0.12
+
+
+def test_an_arm_at_rest_that_is_pushed_away_stops_itself():
+    cell, world = open_twin(objects=1)
+    with cell.arm:
+        built = world._need()
+        wrist = built.joints[robot_model.ARM_JOINTS[3]]
+        for _ in range(24):
+            built.engine.applyExternalForce(
+                built.robot, wrist, (0, 0, -1500), (0, 0, 0), built.engine.LINK_FRAME, physicsClientId=built.client
+            )
+            cell.clock.sleep(1 / 240)
+        assert cell.arm.state().mode is ArmMode.PROTECTIVE_STOP
+
+
+@pytest.mark.parametrize("device", ["arm", "gripper"])
+def test_a_device_that_was_cut_off_while_connecting_leaves_nothing_open(monkeypatch, device):
+    cell, world = open_twin(objects=1)
+
+    def cut_off(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(world, "joint_index", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        getattr(cell, device).connect()
+    # The physics engine must be gone: the fixture for leaks looks for it.
+    with pytest.raises(ConnectionLost):
+        world.objects()

@@ -4,7 +4,7 @@ from scipy.spatial import ConvexHull
 
 from robotcell import kinematics, linkage
 from robotcell.config import load_config
-from robotcell.errors import ConnectionLost
+from robotcell.errors import ConfigError, ConnectionLost
 from robotcell.geometry import transform_points
 from tests.sim_twin.cells import finish, joints_at, open_twin, tool_down, with_block
 
@@ -149,3 +149,15 @@ def test_an_object_that_rolls_off_the_table_does_not_hold_up_the_scene():
             assert area.x[0] <= T[0, 3] <= area.x[1]
             assert area.y[0] <= T[1, 3] <= area.y[1]
             assert T[2, 3] > 0
+
+
+@pytest.mark.parametrize("position", ["[5.0, 5.0, 0.025]", "[0.0, 0.0, -0.5]"])
+def test_a_scene_off_the_table_is_refused(tmp_path, position):
+    path = tmp_path / "far.toml"
+    path.write_text(
+        f'name = "far"\ndrop = false\n[[object]]\nname = "lost cube"\nshape = "cube"\ncolor = "red"\n'
+        f"position = {position}\n"
+    )
+    cell, _ = open_twin(scene=str(path))
+    with pytest.raises(ConfigError, match="'lost cube' fell off the table"), cell.arm:
+        pass
