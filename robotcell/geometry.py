@@ -78,6 +78,12 @@ def rotation_angle(R_a: Array, R_b: Array) -> float:
     return float(np.linalg.norm(matrix_to_rotvec(R_a.T @ R_b)))
 
 
+def cross(a: Array, b: Array) -> Array:
+    """A x b of (..., 3), several times faster than np.cross on few numbers; supervision needs it in every period."""
+    once, twice = [1, 2, 0], [2, 0, 1]
+    return a[..., once] * b[..., twice] - a[..., twice] * b[..., once]
+
+
 def interpolate_transforms(T_start: Array, T_end: Array, fractions: npt.ArrayLike) -> Array:
     """Transforms (N, 4, 4) on the straight line, with slerp for the rotation, at (N,) fractions in [0, 1]."""
     s = np.atleast_1d(np.asarray(fractions, dtype=np.float64))

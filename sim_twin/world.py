@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from robotcell import linkage
 from robotcell.errors import ConfigError, ConnectionLost
-from robotcell.geometry import Array, make_transform
+from robotcell.geometry import Array, cross, make_transform
 from sim_twin import robot_model
 from sim_twin.engine import load_pybullet
 from sim_twin.furniture import furniture
@@ -116,7 +116,7 @@ class Contact:
     def tool_wrench(self, point: Array) -> Array:
         """(6,) force on the gripper [N] and its torque about a point (3,) [N m]."""
         forces = self.forces[self.on_tool]
-        torques = np.cross(self.places[self.on_tool] - point, forces)
+        torques = cross(self.places[self.on_tool] - point, forces)
         return np.concatenate([forces.sum(axis=0), torques.sum(axis=0)])
 
 

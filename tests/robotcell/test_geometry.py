@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from robotcell.geometry import (
     check_transform,
+    cross,
     interpolate_transforms,
     invert_transform,
     look_at,
@@ -26,6 +27,11 @@ transforms = st.builds(lambda r, t: make_transform(rotvec_to_matrix(r), t), vect
 @given(transforms, vector)
 def test_inverse_brings_a_point_back(T: np.ndarray, point: np.ndarray) -> None:
     np.testing.assert_allclose(transform_points(invert_transform(T), transform_points(T, point)), point, atol=1e-9)
+
+
+@given(vector, vector)
+def test_cross_is_the_cross_product(a: np.ndarray, b: np.ndarray) -> None:
+    np.testing.assert_allclose(cross(a, b), np.cross(a, b), atol=1e-12)
 
 
 @given(vector)

@@ -35,6 +35,14 @@ def test_jacobian_is_the_derivative(q: np.ndarray, joint: int) -> None:
     np.testing.assert_allclose((spin[2, 1], spin[0, 2], spin[1, 0]), J[3:], atol=1e-6)
 
 
+@given(joints, joints)
+def test_tool_speed_is_that_of_the_point_before_the_flange(q: np.ndarray, qd: np.ndarray) -> None:
+    h = 1e-6
+    tool = np.array([0.0, 0.0, 0.2, 1.0])
+    before, after = (kinematics.forward(q + sign * h * qd) @ tool for sign in (-1, 1))
+    assert kinematics.tool_speed(q, qd, 0.2) == pytest.approx(np.linalg.norm(after - before) / (2 * h), abs=1e-5)
+
+
 def test_the_stretched_arm_is_singular() -> None:
     assert kinematics.distance_to_singularity((0.0, -1.0, 0.0, -1.0, -1.57, 0.0)) < 1e-9
     assert kinematics.distance_to_singularity((0.0, -1.57, 1.57, -1.57, -1.57, 0.0)) > 0.05
