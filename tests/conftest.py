@@ -39,6 +39,9 @@ def nothing_left_behind() -> Iterator[None]:
     """Fail a test that leaves a thread, a process, a socket, a pybullet client or a file."""
     before = _left_behind()
     yield
+    # A thread that was told to end may need a moment.
+    for thread in set(threading.enumerate()) - before["threads"]:
+        thread.join(timeout=1)
     after = _left_behind()
     leaks = {kind: after[kind] - before[kind] for kind in before if after[kind] - before[kind]}
     assert not leaks, f"left behind: {leaks}"
