@@ -31,7 +31,8 @@ $(VENV)/.installed: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "robotcell needs Python 3.10 or 3.11 on PATH, or: make PYTHON=/path/to/python3.11"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --config-settings editable_mode=compat --editable '.[twin,dev]'
+	@# The build tool warns about folders that are called like packages; an editable install is meant to use them.
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[twin,dev]'
 	@touch $@
 
 clean:
