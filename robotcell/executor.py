@@ -176,10 +176,12 @@ class Executor:
     def _stop(self) -> None:
         """Stop arm and fingers and wait for standstill; an arm that is lost is stopped by its own controller."""
         arm, gripper, clock = self._cell.arm, self._cell.gripper, self._cell.clock
+        # The arm first: a gripper that does not answer must not delay it.
+        with suppress(CellError):
+            arm.stop()
         with suppress(CellError):
             gripper.stop()
         with suppress(CellError):
-            arm.stop()
             deadline = clock.now() + _STOP_TIMEOUT_S
             while arm.moving and clock.now() < deadline:
                 arm.kick()
