@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.grasping import DIRECTIONS, Grasps, Jaw, find_grasps, lay_table
-from policy.pushing import find_pushes
+from policy.pushing import Pushes, find_pushes
 from policy.surface import Surface, cell_centers, estimate_surface
 from robotcell.decision import ROTATIONS, Action, Primitive
 from robotcell.errors import NoTarget
@@ -54,7 +54,7 @@ class HeuristicPolicy:
         heightmap = observation.heightmap
         surface = estimate_surface(heightmap, self._camera, self._table_height_m)
         table = lay_table(surface, _owners(observation), heightmap.workspace.resolution_m, self._jaw.opening_m)
-        grasp = self._best_grasp(find_grasps(table, targets, self._jaw), observation)
+        grasp = self._best(Primitive.GRASP, find_grasps(table, targets, self._jaw), DIRECTIONS, observation)
         if grasp is not None and grasp.q_value >= CLEAR_GRASP:
             return grasp
         push = self._best_push(surface, observation) if observation.may_push else None
@@ -67,54 +67,27 @@ class HeuristicPolicy:
             "rearrange the objects by hand, or choose another goal"
         )
 
-    def _best_grasp(self, grasps: Grasps, observation: Observation) -> Action | None:
-        score = grasps.score.copy()
-        x, y = cell_centers(observation.heightmap.workspace, grasps.row, grasps.col)
+    def _best(
+        self, primitive: Primitive, found: Grasps | Pushes, period: int, observation: Observation
+    ) -> Action | None:
+        """The best of what was found that repeats no failure; rotations are alike after `period` steps."""
+        score = found.score.copy()
+        workspace = observation.heightmap.workspace
+        x, y = cell_centers(workspace, found.row, found.col)
         for barred in observation.barred:
-            if barred.primitive is Primitive.GRASP:
-                score[_same(x, y, grasps.rotation, barred, DIRECTIONS)] = 0
+            if barred.primitive is primitive:
+                score[_same(x, y, found.rotation, barred, period)] = 0
         if not score.any():
             return None
         best = int(score.argmax())
-        return self._action(
-            Primitive.GRASP,
-            observation,
-            (int(grasps.row[best]), int(grasps.col[best]), int(grasps.rotation[best])),
-            float(grasps.surface_m[best]),
-            float(score[best]),
-        )
+        row, col = int(found.row[best]), int(found.col[best])
+        xyz = (*workspace.position(row, col), self._table_height_m + float(found.surface_m[best]))
+        return Action(primitive, row, col, int(found.rotation[best]), xyz, float(score[best]))
 
     def _best_push(self, surface: Surface, observation: Observation) -> Action | None:
         goal = None if observation.goal is None else 1
-        labels = _instances(observation)
-        pushes = find_pushes(surface, labels, goal, observation.heightmap.workspace, self._push_m)
-        score = pushes.score.copy()
-        x, y = cell_centers(observation.heightmap.workspace, pushes.row, pushes.col)
-        for barred in observation.barred:
-            if barred.primitive is Primitive.PUSH:
-                score[_same(x, y, pushes.rotation, barred, ROTATIONS)] = 0
-        if not score.any():
-            return None
-        best = int(score.argmax())
-        return self._action(
-            Primitive.PUSH,
-            observation,
-            (int(pushes.row[best]), int(pushes.col[best]), int(pushes.rotation[best])),
-            float(pushes.surface_m[best]),
-            float(score[best]),
-        )
-
-    def _action(
-        self,
-        primitive: Primitive,
-        observation: Observation,
-        where: tuple[int, int, int],
-        surface_m: float,
-        score: float,
-    ) -> Action:
-        row, col, rotation = where
-        x, y = observation.heightmap.workspace.position(row, col)
-        return Action(primitive, row, col, rotation, (x, y, self._table_height_m + surface_m), score)
+        pushes = find_pushes(surface, _instances(observation), goal, observation.heightmap.workspace, self._push_m)
+        return self._best(Primitive.PUSH, pushes, ROTATIONS, observation)
 
 
 def _owners(observation: Observation) -> npt.NDArray[np.int32]:
