@@ -1,0 +1,1 @@
+"""Training of the network in the twin: environment, collection, replay, learning."""
