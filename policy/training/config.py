@@ -1,0 +1,233 @@
+"""`train.toml`: what a training run does, checked as a whole. With no file the defaults train the shipped network."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from robotcell.errors import ConfigError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pydantic_core import ErrorDetails
+
+# Scene seeds that one stage may use before it would meet those of the next stage or of the next `seed`.
+_SEEDS_PER_STAGE = 200_000
+_MAX_SEED = 4000
+
+# One scene in so many is held out for validation: 6 %.
+_HELD_OUT_EVERY = 16
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class _Table(BaseModel):
+    """A table of train.toml: unknown keys are refused, numbers are finite, nothing changes after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class CollectSettings(_Table):
+    """How a scene is played."""
+
+    # Attempts of each primitive in every state, each from the same saved state.
+    grasps: Annotated[int, Field(ge=0)] = 12
+    pushes: Annotated[int, Field(ge=0)] = 3
+    # States of a scene at most.
+    states: Count = 6
+
+
+class StageSettings(_Table):
+    """How long one stage is, and how it explores."""
+
+    rounds: Count
+    scenes_per_round: Count
+    updates_per_round: Count
+    # Rounds at the beginning that are played by exploration alone.
+    warmup_rounds: Annotated[int, Field(ge=0)]
+    # Part of the attempts that explore: linear from the first round after the warm-up to the last.
+    exploration_start: Probability
+    exploration_end: Probability
+
+    @model_validator(mode="after")
+    def _fits_its_seeds(self) -> StageSettings:
+        if self.rounds * self.scenes_per_round > _SEEDS_PER_STAGE:
+            raise ValueError(f"rounds x scenes_per_round must not exceed {_SEEDS_PER_STAGE}")
+        return self
+
+    @property
+    def updates(self) -> int:
+        """Updates of the whole stage."""
+        return self.rounds * self.updates_per_round
+
+
+class LearningSettings(_Table):
+    """Double DQN with prioritised replay."""
+
+    # States per update; each brings all that was tried in it.
+    batch: Count = 8
+    # Adam; follows half a cosine from the first to the last update of a stage.
+    learning_rate: Positive = 1e-3
+    final_learning_rate: Positive = 1e-4
+    gradient_norm: Positive = 5.0
+    # Paper: "gamma = 0.5".
+    gamma: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    # Updates between two copies of the network to the target network.
+    target_sync: Count = 200
+    # Exponents of prioritised replay; beta grows from its start to 1 over a stage.
+    priority_alpha: Probability = 0.6
+    priority_beta_start: Probability = 0.4
+    push_weight: Positive = 1.0
+    # States after a push that an update evaluates for each state of its batch.
+    next_states: Count = 1
+    # States in memory; the oldest shards are left out. A state of 224 x 224 cells takes 0.3 MB.
+    capacity_states: Count = 16_000
+
+
+class TrainConfig(_Table):
+    """A whole training run."""
+
+    seed: Annotated[int, Field(ge=0, le=_MAX_SEED)] = 0
+    architecture: str = "fast"
+    # Scenes of training; evaluations use seeds below.
+    first_seed: Annotated[int, Field(ge=1_000_000, le=100_000_000)] = 1_000_000
+    # Scenes that one worker plays at a time; a shard holds their states.
+    scenes_per_task: Count = 4
+    collect: CollectSettings = CollectSettings()
+    learning: LearningSettings = LearningSettings()
+    stage1: StageSettings = StageSettings(
+        rounds=24,
+        scenes_per_round=48,
+        updates_per_round=300,
+        warmup_rounds=2,
+        exploration_start=0.5,
+        exploration_end=0.1,
+    )
+    stage2: StageSettings = StageSettings(
+        rounds=24,
+        scenes_per_round=48,
+        updates_per_round=300,
+        warmup_rounds=0,
+        exploration_start=0.3,
+        exploration_end=0.1,
+    )
+
+    def stage(self, number: int) -> StageSettings:
+        """The settings of stage 1 or 2."""
+        return self.stage1 if number == 1 else self.stage2
+
+    def scene_seeds(self, stage: int, round_: int) -> tuple[int, ...]:
+        """The scenes of a round: the same for any number of workers, no two rounds share one."""
+        scenes = self.stage(stage).scenes_per_round
+        first = self.first_seed + (2 * self.seed + stage - 1) * _SEEDS_PER_STAGE + round_ * scenes
+        return tuple(range(first, first + scenes))
+
+    def exploration(self, stage: int, round_: int) -> float:
+        """The part of the attempts that explore."""
+        plan = self.stage(stage)
+        if round_ < plan.warmup_rounds:
+            return 1.0
+        last = plan.rounds - 1 - plan.warmup_rounds
+        passed = (round_ - plan.warmup_rounds) / last if last > 0 else 0.0
+        return plan.exploration_start + passed * (plan.exploration_end - plan.exploration_start)
+
+
+def held_out(scene_seed: int) -> bool:
+    """Whether a scene is kept for validation and never trained on."""
+    return scene_seed % _HELD_OUT_EVERY == 0
+
+
+def with_rounds(config: TrainConfig, stage: int, rounds: int) -> TrainConfig:
+    """The same configuration with another number of rounds in one stage.
+
+    Raises:
+        ConfigError: a stage cannot have so many.
+    """
+    values = config.model_dump()
+    values[f"stage{stage}"]["rounds"] = rounds
+    return _validated(values, "the number of rounds")
+
+
+def single_stage(config: TrainConfig) -> TrainConfig:
+    """Stage 2 alone with as many scenes and updates as both stages have, and the beginning of stage 1."""
+    one, two = config.stage1, config.stage2
+    rounds = one.rounds + two.rounds
+    scenes = one.rounds * one.scenes_per_round + two.rounds * two.scenes_per_round
+    alone = two.model_copy(
+        update={
+            "rounds": rounds,
+            "scenes_per_round": -(-scenes // rounds),
+            "updates_per_round": -(-(one.updates + two.updates) // rounds),
+            "warmup_rounds": one.warmup_rounds,
+            "exploration_start": one.exploration_start,
+        }
+    )
+    return _validated(config.model_copy(update={"stage2": alone}).model_dump(), "a single stage")
+
+
+def load_train_config(path: Path | None = None) -> TrainConfig:
+    """Read and check a training file; None for the defaults.
+
+    A stage that the file names only in part keeps the defaults of its other values.
+
+    Raises:
+        ConfigError: naming every bad key at once, each with its value and what is allowed.
+    """
+    if path is None:
+        return TrainConfig()
+    values = _read(path)
+    for name in ("stage1", "stage2"):
+        given = values.get(name)
+        if isinstance(given, dict):
+            values[name] = TrainConfig.model_fields[name].default.model_dump() | given
+    return _validated(values, str(path))
+
+
+def save_train_config(config: TrainConfig, path: Path) -> None:
+    """Write the configuration as TOML with all values filled in; it reads back as the same."""
+    lines, tables = [], []
+    for key, value in config.model_dump().items():
+        if isinstance(value, dict):
+            # What JSON writes for a number or a string is TOML as well.
+            tables += ["", f"[{key}]", *(f"{name} = {json.dumps(inner)}" for name, inner in value.items())]
+        else:
+            lines.append(f"{key} = {json.dumps(value)}")
+    path.write_text("\n".join([*lines, *tables, ""]), encoding="utf-8")
+
+
+def _validated(values: dict[str, Any], place: str) -> TrainConfig:
+    try:
+        return TrainConfig.model_validate(values)
+    except ValidationError as error:
+        problems = [_describe(detail) for detail in error.errors()]
+        raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems])) from None
+
+
+def _describe(detail: ErrorDetails) -> str:
+    key = ".".join(str(part) for part in detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        return f"{key} = {detail['input']!r}: unknown key; see docs/training.md for those that exist"
+    return f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        return values
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from examples/train.toml") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
