@@ -30,4 +30,10 @@ def _heuristic(config: CellConfig) -> Policy:
     return HeuristicPolicy(config)
 
 
-_MAKERS: dict[str, Callable[[CellConfig], Policy]] = {"heuristic": _heuristic}
+def _random(config: CellConfig) -> Policy:
+    from policy.random_policy import RandomPolicy
+
+    return RandomPolicy(config)
+
+
+_MAKERS: dict[str, Callable[[CellConfig], Policy]] = {"heuristic": _heuristic, "random": _random}

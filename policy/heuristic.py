@@ -7,23 +7,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from policy.grasping import DIRECTIONS, Grasps, Jaw, find_grasps, lay_table
+from policy.grasping import Grasps, Jaw, find_grasps, lay_table
 from policy.pushing import Pushes, find_pushes
+from policy.repeats import repeats
 from policy.surface import Surface, cell_centers, estimate_surface
-from robotcell.decision import ROTATIONS, Action, Primitive
+from robotcell.decision import Action, Primitive
 from robotcell.errors import NoTarget
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from robotcell.decision import Observation
-    from robotcell.geometry import Array
 
 # A grasp that scores less is worth a push first, where one is allowed.
 CLEAR_GRASP = 0.30
 # A push must promise at least this much (the paper's tau, a gain of a tenth of the goal's border).
 USEFUL_PUSH = 0.10
-# An action this near to one that failed, and turned by at most one step, is the same action again.
-_SAME_M = 0.020
 
 
 class HeuristicPolicy:
@@ -54,7 +52,7 @@ class HeuristicPolicy:
         heightmap = observation.heightmap
         surface = estimate_surface(heightmap, self._camera, self._table_height_m)
         table = lay_table(surface, _owners(observation), heightmap.workspace.resolution_m, self._jaw.opening_m)
-        grasp = self._best(Primitive.GRASP, find_grasps(table, targets, self._jaw), DIRECTIONS, observation)
+        grasp = self._best(Primitive.GRASP, find_grasps(table, targets, self._jaw), observation)
         if grasp is not None and grasp.q_value >= CLEAR_GRASP:
             return grasp
         push = self._best_push(surface, observation) if observation.may_push else None
@@ -67,16 +65,12 @@ class HeuristicPolicy:
             "rearrange the objects by hand, or choose another goal"
         )
 
-    def _best(
-        self, primitive: Primitive, found: Grasps | Pushes, period: int, observation: Observation
-    ) -> Action | None:
-        """The best of what was found that repeats no failure; rotations are alike after `period` steps."""
+    def _best(self, primitive: Primitive, found: Grasps | Pushes, observation: Observation) -> Action | None:
+        """The best of what was found that repeats no failure."""
         score = found.score.copy()
         workspace = observation.heightmap.workspace
         x, y = cell_centers(workspace, found.row, found.col)
-        for barred in observation.barred:
-            if barred.primitive is primitive:
-                score[_same(x, y, found.rotation, barred, period)] = 0
+        score[repeats(primitive, x, y, found.rotation, observation.barred)] = 0
         if not score.any():
             return None
         best = int(score.argmax())
@@ -87,7 +81,7 @@ class HeuristicPolicy:
     def _best_push(self, surface: Surface, observation: Observation) -> Action | None:
         goal = None if observation.goal is None else 1
         pushes = find_pushes(surface, _instances(observation), goal, observation.heightmap.workspace, self._push_m)
-        return self._best(Primitive.PUSH, pushes, ROTATIONS, observation)
+        return self._best(Primitive.PUSH, pushes, observation)
 
 
 def _owners(observation: Observation) -> npt.NDArray[np.int32]:
@@ -103,16 +97,3 @@ def _instances(observation: Observation) -> npt.NDArray[np.int32]:
     if observation.goal is None:
         return labels
     return np.where(observation.goal, 1, np.where(labels > 0, labels + 1, 0)).astype(np.int32)
-
-
-def _same(
-    x: Array,
-    y: Array,
-    rotation: npt.NDArray[np.intp],
-    barred: Action,
-    period: int,
-) -> npt.NDArray[np.bool_]:
-    """Which actions would repeat one that failed."""
-    near = np.hypot(x - barred.xyz[0], y - barred.xyz[1]) < _SAME_M
-    turn = np.abs(rotation - barred.rotation) % period
-    return np.asarray(near & (np.minimum(turn, period - turn) <= 1), np.bool_)

@@ -1,0 +1,127 @@
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from policy import make_policy
+from robotcell.config import CellConfig, Table, Workspace
+from robotcell.decision import Observation, Primitive
+from robotcell.errors import NoTarget
+from tests.robotcell.maps import heightmap
+
+CONFIG = CellConfig()
+TABLE_M = CONFIG.table.height_m
+
+
+def look(*boxes, goal=None, barred=(), may_push=True, workspace=None):
+    """Boxes (row, col, side, height) in cells and metres; `goal` is the number of one of them."""
+    workspace = workspace or Workspace()
+    heights = np.zeros(workspace.shape, np.float32)
+    labels = np.zeros(workspace.shape, np.int32)
+    for number, (row, col, side, height_m) in enumerate(boxes, start=1):
+        heights[row : row + side, col : col + side] = height_m
+        labels[row : row + side, col : col + side] = number
+    mask = None if goal is None else labels == goal
+    return Observation(heightmap(heights, workspace), labels, mask, barred, may_push)
+
+
+def same(one, other):
+    period = 8 if one.primitive is Primitive.GRASP else 16
+    turn = (one.rotation - other.rotation) % period
+    near = math.dist(one.xyz[:2], other.xyz[:2]) < 0.02
+    return one.primitive is other.primitive and near and min(turn, period - turn) <= 1
+
+
+PAIR = ((40, 60, 25, 0.05), (120, 150, 20, 0.03))
+
+
+def test_draws_are_spread_over_primitives_cells_and_rotations():
+    policy, scene = make_policy("random", CONFIG), look(*PAIR)
+    actions = [policy.decide(scene) for _ in range(600)]
+    primitives = Counter(action.primitive for action in actions)
+    assert min(primitives.values()) > 250
+    for primitive, rotations in ((Primitive.GRASP, 8), (Primitive.PUSH, 16)):
+        turns = Counter(action.rotation for action in actions if action.primitive is primitive)
+        assert sorted(turns) == list(range(rotations))
+        assert max(turns.values()) < 3 * primitives[primitive] / rotations
+    on_first = [scene.labels[a.row, a.col] == 1 for a in actions if a.primitive is Primitive.GRASP]
+    assert np.mean(on_first) == pytest.approx(625 / 1025, abs=0.08)  # by area
+    assert {action.q_value for action in actions} == {0.0}
+
+
+@settings(max_examples=30)
+@given(
+    goal=st.sampled_from([None, 1, 2]), may_push=st.booleans(), table_m=st.floats(-0.1, 0.1), draws=st.integers(1, 5)
+)
+def test_an_action_is_where_it_says_and_where_it_may_be(goal, may_push, table_m, draws):
+    scene = look(*PAIR, goal=goal, may_push=may_push)
+    policy = make_policy("random", CellConfig(table=Table(height_m=table_m)))
+    targets = scene.objects if goal is None else scene.goal
+    tops = {1: 0.05, 2: 0.03}
+    for _ in range(draws):
+        action = policy.decide(scene)
+        assert Workspace().cell(*action.xyz[:2]) == (action.row, action.col)
+        assert may_push or action.primitive is Primitive.GRASP
+        if action.primitive is Primitive.GRASP:
+            assert targets[action.row, action.col]
+            top = tops[scene.labels[action.row, action.col]]
+        else:
+            assert not scene.objects[action.row, action.col]
+            rows, cols = np.nonzero(targets)
+            nearest = np.maximum(abs(rows - action.row), abs(cols - action.col)).argmin()
+            assert max(abs(rows[nearest] - action.row), abs(cols[nearest] - action.col)) <= 15
+            top = tops[scene.labels[rows[nearest], cols[nearest]]]
+        assert action.xyz[2] == pytest.approx(table_m + top, abs=1e-6)
+
+
+def test_the_reach_of_pushes_is_in_metres():
+    workspace = Workspace(resolution_m=0.005)
+    policy = make_policy("random", CellConfig(workspace=workspace))
+    scene = look((40, 40, 10, 0.05), workspace=workspace)
+    pushes = [a for a in (policy.decide(scene) for _ in range(300)) if a.primitive is Primitive.PUSH]
+    reach = max(max(40 - a.row, a.row - 49, 40 - a.col, a.col - 49) for a in pushes)
+    assert reach == 6
+
+
+def test_the_same_seed_gives_the_same_actions_and_each_decision_another():
+    scene = look(*PAIR)
+    first, second = make_policy("random", CONFIG), make_policy("random", CONFIG)
+    actions = [first.decide(scene) for _ in range(10)]
+    assert actions == [second.decide(scene) for _ in range(10)]
+    assert len(set(actions)) == 10
+
+
+@pytest.mark.parametrize("may_push", [False, True])
+def test_what_failed_is_not_repeated_until_nothing_is_left(may_push):
+    workspace = Workspace(x=(-0.54, -0.46), y=(-0.04, 0.04), resolution_m=0.01)
+    policy, barred = make_policy("random", CellConfig(workspace=workspace)), ()
+
+    message = "every grasp and every push has failed" if may_push else "every grasp has failed"
+    with pytest.raises(NoTarget, match=message):  # noqa: PT012
+        while True:
+            scene = look((3, 3, 2, 0.05), barred=barred, may_push=may_push, workspace=workspace)
+            action = policy.decide(scene)
+            assert not any(same(action, failed) for failed in barred)
+            barred = (*barred, action)
+    assert len(barred) > 20 if may_push else len(barred) in {3, 4}
+
+
+def test_an_object_that_fills_the_map_can_only_be_grasped():
+    policy = make_policy("random", CONFIG)
+    full = look((0, 0, 224, 0.05))
+    assert {policy.decide(full).primitive for _ in range(20)} == {Primitive.GRASP}
+
+
+def test_nothing_to_act_on():
+    policy = make_policy("random", CONFIG)
+    with pytest.raises(NoTarget, match="no object is seen"):
+        policy.decide(look())
+    with pytest.raises(NoTarget, match="no cell of the goal is seen"):
+        policy.decide(look(*PAIR, goal=3))
+
+
+def test_it_is_called_random():
+    assert make_policy("random", CONFIG).name == "random"
