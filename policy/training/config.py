@@ -104,6 +104,8 @@ class TrainConfig(_Table):
     first_seed: Annotated[int, Field(ge=1_000_000, le=100_000_000)] = 1_000_000
     # Scenes that one worker plays at a time; a shard holds their states.
     scenes_per_task: Count = 4
+    # Stage 2 alone, without the weights and the shards of a stage 1 (an ablation).
+    single_stage: bool = False
     collect: CollectSettings = CollectSettings()
     learning: LearningSettings = LearningSettings()
     stage1: StageSettings = StageSettings(
@@ -161,6 +163,8 @@ def with_rounds(config: TrainConfig, stage: int, rounds: int) -> TrainConfig:
 
 def single_stage(config: TrainConfig) -> TrainConfig:
     """Stage 2 alone with as many scenes and updates as both stages have, and the beginning of stage 1."""
+    if config.single_stage:
+        return config
     one, two = config.stage1, config.stage2
     rounds = one.rounds + two.rounds
     scenes = one.rounds * one.scenes_per_round + two.rounds * two.scenes_per_round
@@ -173,7 +177,7 @@ def single_stage(config: TrainConfig) -> TrainConfig:
             "exploration_start": one.exploration_start,
         }
     )
-    return _validated(config.model_copy(update={"stage2": alone}).model_dump(), "a single stage")
+    return _validated(config.model_copy(update={"stage2": alone, "single_stage": True}).model_dump(), "a single stage")
 
 
 def load_train_config(path: Path | None = None) -> TrainConfig:

@@ -1,0 +1,49 @@
+"""The state of a stage between two rounds, in one file that is always whole."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from robotcell.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_VERSION = 1
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Replace the checkpoint; a process that is killed leaves the old one or the new one.
+
+    Args:
+        path: of the checkpoint.
+        state: tensors, numbers, strings, and dictionaries and lists of them.
+    """
+    partial = path.with_suffix(".partial")
+    with partial.open("wb") as file:
+        torch.save({"version": _VERSION, **state}, file)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """What `save_checkpoint` wrote, on the CPU. Runs no code that a file may contain.
+
+    Raises:
+        ConfigError: the file is damaged, or another program's.
+    """
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise ConfigError(
+            f"{path}: not a whole checkpoint ({str(error).splitlines()[0]}); put a copy back, or delete it and "
+            "resume: the shards are learned from again, and no scene is played twice"
+        ) from error
+    if not isinstance(state, dict) or state.get("version") != _VERSION:
+        raise ConfigError(f"{path}: a checkpoint of another version of this program; train into another --run folder")
+    return state

@@ -1,0 +1,42 @@
+"""How a training run goes, as one picture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+# Title, axis, and which metrics a panel shows under which name.
+_PANELS: tuple[tuple[str, str, dict[str, str]], ...] = (
+    ("Grasps", "rewarded", {"greedy_grasp_success": "greedy", "grasp_success": "all"}),
+    ("Pushes", "rewarded", {"push_rewarded": "all"}),
+    ("Held-out scenes", "area under ROC", {"grasp_auc": "grasp", "push_auc": "push"}),
+    ("Loss", "Huber", {"grasp_loss": "grasp", "push_loss": "push"}),
+    ("Error", "mean |TD error|", {"td_error": "all attempts"}),
+    ("Learning rate and exploration", "", {"learning_rate": "learning rate", "exploration": "exploration"}),
+)
+
+
+def draw_curves(history: Sequence[dict[str, float]], path: Path) -> None:
+    """Draw the metrics of all rounds as a PNG; a line marks where stage 2 begins. Replaces the file at once."""
+    figure = Figure(figsize=(13, 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    rounds = range(1, len(history) + 1)
+    boundaries = [i + 0.5 for i in range(1, len(history)) if history[i]["stage"] != history[i - 1]["stage"]]
+    for axes, (title, label, names) in zip(figure.subplots(2, 3).flat, _PANELS, strict=True):
+        for key, name in names.items():
+            axes.plot(rounds, [line[key] for line in history], marker=".", label=name)
+        for boundary in boundaries:
+            axes.axvline(boundary, color="gray", linestyle="--", linewidth=1)
+        axes.set(title=title, xlabel="round", ylabel=label)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.axes[-1].set_yscale("log")
+    partial = path.with_suffix(".partial")
+    figure.savefig(partial, format="png", dpi=100)
+    partial.replace(path)

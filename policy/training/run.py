@@ -1,0 +1,365 @@
+"""A training run: rounds of playing scenes, learning from all that was played, and a checkpoint.
+
+Everything lies in the folder of the run, and everything random is a function of the configuration and of the number
+of the round or update. So a run that was killed goes on where it was, and any number of workers plays the same.
+
+    metrics.jsonl, curves.png, weights.safetensors      of the newest round
+    stage1/, stage2/    train.toml, checkpoint.pt, weights.safetensors, shards/r0003-t002.npz (round, task)
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import time
+import zipfile
+from contextlib import closing
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from policy.networks import make_network
+from policy.parallel import run_tasks
+from policy.training import collect as playing
+from policy.training.checkpoint import load_checkpoint, save_checkpoint
+from policy.training.config import load_train_config, save_train_config
+from policy.training.curves import draw_curves
+from policy.training.learner import Learner
+from policy.training.replay import Replay
+from policy.training.shard import GRASP, PUSH, Shard
+from policy.weights import save_weights
+from robotcell.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from policy.training.config import TrainConfig
+
+    Metrics = dict[str, float]
+    # (what is being done, how much of it is done, of how much)
+    Progress = Callable[[str, int, int], None]
+
+# Held-out states that each round is measured on, the newest.
+_VALIDATION_STATES = 256
+
+
+def train(
+    config: TrainConfig,
+    stage: int,
+    run: Path,
+    *,
+    workers: int | None = None,
+    ray_address: str | None = None,
+    collect: Callable[[playing.Collection], Shard] = playing.collect,
+    on_progress: Progress = lambda _what, _done, _total: None,
+    on_round: Callable[[Metrics], None] = lambda _metrics: None,
+) -> Path:
+    """Train one stage to its end, from wherever its folder says that it is.
+
+    Args:
+        config: as `prepare` returned it.
+        stage: 1 or 2.
+        run: folder of the run.
+        workers: that play scenes; see `policy.parallel.run_tasks`.
+        ray_address: of a Ray cluster that sees the folder of the run under the same path.
+        collect: plays the scenes of a task.
+        on_progress: told while a round collects and learns.
+        on_round: given the metrics of each round as it ends.
+
+    Returns:
+        The trained weights.
+
+    Raises:
+        ConfigError: stage 1 is not finished, or a file of the run is damaged.
+    """
+    folder = run / f"stage{stage}"
+    plan = config.stage(stage)
+    torch.manual_seed(config.seed)
+    learner = Learner(make_network(config.architecture), config.learning, stage, plan.updates, config.seed)
+    earlier = [] if stage == 1 or config.single_stage else _finished_stage1(run, learner)
+    first = 0
+    checkpoint = None
+    if (folder / "checkpoint.pt").exists():
+        checkpoint = load_checkpoint(folder / "checkpoint.pt")
+        learner.load_state(checkpoint)
+        first = checkpoint["rounds"]
+    history = [line for line in read_metrics(run) if (line["stage"], line["round"]) < (stage, first)]
+    _write_metrics(run, history)
+    replay = Replay(stage, config.learning.capacity_states, config.learning.priority_alpha)
+    played = [path for path in _shard_paths(folder) if _round_of(path) < first]
+    replay.extend(_newest([*earlier, *played], config.learning.capacity_states))
+    if checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
+        # Somebody may have deleted a shard; then all states are as new.
+        replay.priorities = checkpoint["priorities"].numpy()
+    _write_weights(run, folder, config, stage, learner, history)
+    for round_ in range(first, plan.rounds):
+        start = time.perf_counter()
+        shards, collected = _collect(config, stage, round_, folder, collect, workers, ray_address, on_progress)
+        replay.extend(shards)
+        if not len(replay):
+            raise ConfigError(
+                f"{folder / 'shards'}: the scenes of round {round_} gave nothing to learn from; set a larger "
+                "scenes_per_round, collect.grasps or collect.pushes, and train into another --run folder"
+            )
+        learned = _learn(learner, replay, plan.updates_per_round * (round_ + 1), on_progress)
+        metrics: Metrics = {
+            "stage": stage,
+            "round": round_,
+            "rounds": plan.rounds,
+            "exploration": config.exploration(stage, round_),
+            **collected,
+            **learned,
+            **learner.validate(replay.validation(_VALIDATION_STATES)),
+            "hours": (history[-1]["hours"] if history else 0.0) + (time.perf_counter() - start) / 3600,
+        }
+        history.append(metrics)
+        # The metrics first: a round without a checkpoint is done again, and its line is written anew.
+        _write_metrics(run, history)
+        state = {"rounds": round_ + 1, "stage": stage, "config": config.model_dump_json()}
+        state["priorities"] = torch.from_numpy(replay.priorities)
+        save_checkpoint(folder / "checkpoint.pt", {**learner.state(), **state})
+        _write_weights(run, folder, config, stage, learner, history)
+        draw_curves(history, run / "curves.png")
+        on_round(metrics)
+    return folder / "weights.safetensors"
+
+
+def prepare(config: TrainConfig | None, stage: int, run: Path, *, resume: bool) -> TrainConfig:
+    """Check that a stage can start or go on, and write its train.toml.
+
+    Args:
+        config: None for that of the stage when it is resumed, that of stage 1 when stage 2 starts, or the defaults.
+        stage: 1 or 2.
+        run: folder of the run.
+        resume: whether the stage is to have been started already.
+
+    Returns:
+        The configuration that counts.
+
+    Raises:
+        ConfigError: the stage has been started (or has not, with `resume`), or has to wait for stage 1.
+    """
+    folder = run / f"stage{stage}"
+    written = folder / "train.toml"
+    if resume:
+        if not written.exists():
+            raise ConfigError(f"{folder}: there is nothing to resume; start it without --resume")
+        config = config or load_train_config(written)
+    else:
+        if written.exists():
+            raise ConfigError(f"{folder}: this stage was started before; go on with --resume, or choose another --run")
+        if config is None:
+            first = run / "stage1" / "train.toml"
+            config = load_train_config(first if stage == 2 and first.exists() else None)
+    if stage == 1 and config.single_stage:
+        raise ConfigError("single_stage = true: this configuration has no stage 1; use --stage 2")
+    if stage == 2 and not config.single_stage:
+        _check_stage1(run)
+    try:
+        (folder / "shards").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made ({error.strerror}); choose another --run") from error
+    partial = written.with_suffix(".partial")
+    save_train_config(config, partial)
+    partial.replace(written)
+    return config
+
+
+def read_metrics(run: Path) -> list[Metrics]:
+    """The metrics of all rounds so far; a line that was cut off by a kill is left out."""
+    path = run / "metrics.jsonl"
+    if not path.exists():
+        return []
+    lines = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            lines.append({key: math.nan if value is None else value for key, value in json.loads(line).items()})
+        except ValueError:
+            continue
+    return lines
+
+
+def _collect(
+    config: TrainConfig,
+    stage: int,
+    round_: int,
+    folder: Path,
+    collect: Callable[[playing.Collection], Shard],
+    workers: int | None,
+    ray_address: str | None,
+    on_progress: Progress,
+) -> tuple[list[Shard], Metrics]:
+    """The shards of a round, in the order of its tasks; only those that are not there yet are played."""
+    start = time.perf_counter()
+    blind = round_ < config.stage(stage).warmup_rounds
+    weights = None if blind else (folder / "weights.safetensors").resolve()
+    seeds, step = config.scene_seeds(stage, round_), config.scenes_per_task
+    missing: dict[Path, playing.Collection] = {}
+    paths = []
+    for task, first in enumerate(range(0, len(seeds), step)):
+        path = folder / "shards" / f"r{round_:04d}-t{task:03d}.npz"
+        paths.append(path)
+        if not path.exists():
+            missing[path] = playing.Collection(
+                stage=stage,
+                seeds=seeds[first : first + step],
+                weights=weights,
+                exploration=config.exploration(stage, round_),
+                settings=config.collect,
+            )
+    places = list(missing)
+    done, attempts = len(paths) - len(missing), 0
+    on_progress("collect", done, len(paths))
+    if missing:
+        with closing(run_tasks(collect, missing.values(), workers, ray_address)) as results:  # type: ignore[type-var]
+            for index, shard in results:
+                shard.save(places[index])
+                done += 1
+                attempts += len(shard.state)
+                on_progress("collect", done, len(paths))
+    seconds = time.perf_counter() - start
+    shards = [_load(path) for path in paths]
+    return shards, {
+        "scenes": len(seeds),
+        "states": sum(len(shard.scene) for shard in shards),
+        "attempts": sum(len(shard.state) for shard in shards),
+        **_success(shards, stage),
+        "attempts_per_s": attempts / seconds,
+        "collect_s": seconds,
+    }
+
+
+def _success(shards: list[Shard], stage: int) -> Metrics:
+    """The part of the attempts that was rewarded."""
+    primitive = np.concatenate([shard.primitive for shard in shards])
+    rewarded = np.concatenate([shard.reward[:, stage - 1] for shard in shards]) > 0
+    greedy = np.concatenate([shard.greedy for shard in shards])
+    grasps, pushes = primitive == GRASP, primitive == PUSH
+    return {
+        "grasp_success": _part(rewarded[grasps]),
+        "greedy_grasp_success": _part(rewarded[grasps & greedy]),
+        "greedy_grasps": int((grasps & greedy).sum()),
+        "push_rewarded": _part(rewarded[pushes]),
+    }
+
+
+def _part(values: np.typing.NDArray[np.bool_]) -> float:
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _learn(learner: Learner, replay: Replay, until: int, on_progress: Progress) -> Metrics:
+    """Update until so many updates of the stage are done."""
+    start = time.perf_counter()
+    rate = learner.learning_rate
+    first = learner.updates
+    losses = []
+    while learner.updates < until:
+        losses.append(learner.update(replay))
+        on_progress("learn", learner.updates - first, until - first)
+    grasp, push, error = (
+        float(np.nanmean(values)) if not np.isnan(values).all() else math.nan
+        for values in (np.array([getattr(loss, name) for loss in losses]) for name in ("grasp", "push", "error"))
+    )
+    return {
+        "replay": len(replay),
+        "updates": learner.updates,
+        "learning_rate": rate,
+        "grasp_loss": grasp,
+        "push_loss": push,
+        "td_error": error,
+        "learn_s": time.perf_counter() - start,
+    }
+
+
+def _finished_stage1(run: Path, learner: Learner) -> list[Path]:
+    """Start from the network of stage 1; its shards."""
+    state = _check_stage1(run)
+    learner.online.load_state_dict(state["online"])
+    learner.target.load_state_dict(state["online"])
+    return _shard_paths(run / "stage1")
+
+
+def _check_stage1(run: Path) -> dict[str, dict[str, torch.Tensor]]:
+    folder = run / "stage1"
+    path = folder / "checkpoint.pt"
+    if not path.exists():
+        raise ConfigError(
+            f"{folder}: stage 2 goes on from stage 1, and no round of it is finished; run --stage 1 first, or "
+            "--from-scratch to do without"
+        )
+    state = load_checkpoint(path)
+    planned = load_train_config(folder / "train.toml").stage1.rounds
+    if state["rounds"] < planned:
+        raise ConfigError(
+            f"{folder}: stage 1 has finished {state['rounds']} of {planned} rounds; run --stage 1 --resume first"
+        )
+    return state
+
+
+def _shard_paths(folder: Path) -> list[Path]:
+    """In the order in which they were asked for."""
+    return sorted((folder / "shards").glob("r*-t*.npz"))
+
+
+def _round_of(path: Path) -> int:
+    return int(path.name[1:5])
+
+
+def _newest(paths: list[Path], capacity_states: int) -> list[Shard]:
+    """The newest shards that the replay has room for, oldest first: what fell out of it need not be read."""
+    shards: list[Shard] = []
+    states = 0
+    for path in reversed(paths):
+        shard = _load(path)
+        states += len(shard.scene)
+        if shards and states > capacity_states:
+            break
+        shards.append(shard)
+    return shards[::-1]
+
+
+def _load(path: Path) -> Shard:
+    try:
+        return Shard.load(path)
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise ConfigError(
+            f"{path}: not a whole shard ({error}); delete it and go on with --resume, which plays its scenes again "
+            "if the round needs them"
+        ) from error
+
+
+def _write_weights(
+    run: Path, folder: Path, config: TrainConfig, stage: int, learner: Learner, history: list[Metrics]
+) -> None:
+    """The online network: for the next round's workers, and as the newest of the run."""
+    card = {
+        "stage": str(stage),
+        "updates": str(learner.updates),
+        "training": config.model_dump_json(),
+        "last_round": _json(history[-1]) if history else "{}",
+    }
+    weights = folder / "weights.safetensors"
+    save_weights(weights, learner.online, config.architecture, card)
+    partial = run / "weights.partial"
+    shutil.copyfile(weights, partial)
+    partial.replace(run / weights.name)
+
+
+def _write_metrics(run: Path, history: list[Metrics]) -> None:
+    path = run / "metrics.jsonl"
+    partial = path.with_suffix(".partial")
+    with partial.open("w", encoding="utf-8") as file:
+        file.writelines(_json(line) + "\n" for line in history)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def _json(metrics: Metrics) -> str:
+    """One line; what is not a number is null."""
+    known = {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in metrics.items()}
+    return json.dumps(known)
