@@ -159,6 +159,23 @@ def push_height(surface_m: float, config: CellConfig) -> float:
     return max(surface_m / 2, config.gripper.tip_clearance_m)
 
 
+def near_height(
+    heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float, tcp_z: float, config: CellConfig
+) -> float:
+    """z of the tcp [m] at which the guarded part of a descent to `tcp_z` begins.
+
+    Args:
+        heightmap: what is known of the surroundings.
+        x, y, theta: where the tool comes down, and how it is turned [m, rad].
+        opening_m: of the fingers, whose tips draw back as they open.
+        tcp_z: z of the tcp at the end of the descent [m].
+        config: of the cell.
+    """
+    highest = config.table.height_m + _clear_above(heightmap, x, y, theta, opening_m)
+    near = highest + _NEAR_M - linkage.tip_retraction(opening_m)
+    return float(np.clip(near, tcp_z, tcp_z + config.motion.approach_m))
+
+
 def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
     table, use, motion = config.table.height_m, config.gripper, config.motion
     x, y, z = action.xyz
@@ -170,8 +187,7 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
     T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
     T_near, T_grasp, T_lifted = (T_above.copy() for _ in range(3))
     T_lifted[2, 3] = max(approach_z, table + config.bin.wall_height_m + LOAD_REACH_M + _CARRY_CLEARANCE_M)
-    highest = table + _clear_above(heightmap, x, y, theta, use.preshape_m)
-    T_near[2, 3] = float(np.clip(highest + _NEAR_M - linkage.tip_retraction(use.preshape_m), tcp_z, approach_z))
+    T_near[2, 3] = near_height(heightmap, x, y, theta, use.preshape_m, tcp_z, config)
     T_grasp[2, 3] = tcp_z
     bin_x, bin_y = _release_point(x, y, config)
     bin_z = table + config.bin.wall_height_m + _BIN_CLEARANCE_M
@@ -223,8 +239,7 @@ def _plan_push(action: Action, heightmap: Heightmap, q_start: Array, config: Cel
     q_above = _solve("approach", tool_down(x, y, approach_z, action.theta), config)
     T_above = kinematics.forward(q_above) @ linkage.T_FLANGE_TCP
     T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
-    highest = table + _clear_above(heightmap, x, y, action.theta, linkage.MIN_WIDTH_M)
-    T_near[2, 3] = float(np.clip(highest + _NEAR_M, tcp_z, approach_z))
+    T_near[2, 3] = near_height(heightmap, x, y, action.theta, linkage.MIN_WIDTH_M, tcp_z, config)
     T_start[2, 3] = tcp_z
     T_end[:3, 3] = (end_x, end_y, tcp_z)
     T_up[:3, 3] = (end_x, end_y, approach_z)

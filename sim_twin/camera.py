@@ -99,6 +99,14 @@ class TwinCamera(Camera):
         Raises:
             ConnectionLost: the camera is not connected.
         """
+        return self.read_with_truth()[0]
+
+    def read_with_truth(self) -> tuple[RgbdFrame, Indices]:
+        """The next frame, and the index (H, W) into `world.visuals()` of what each pixel really shows, -1 = nothing.
+
+        Raises:
+            ConnectionLost: the camera is not connected.
+        """
         first_frame = self._connected()
         self._world.step(_STEPS_PER_FRAME)
         t, number = self._world.time_s, self._frame_number()
@@ -119,7 +127,8 @@ class TwinCamera(Camera):
             t=t,
             frames_since_start=number - first_frame,
         )
-        return RgbdFrame(t=t, number=number, color=color, depth_m=depth, intrinsics=self._intrinsics)
+        frame = RgbdFrame(t=t, number=number, color=color, depth_m=depth, intrinsics=self._intrinsics)
+        return frame, hits.visual()
 
     def render_truth(self) -> tuple[npt.NDArray[np.float32], Indices]:
         """What is really in front of the camera now: for scores, labels and tests, never for a decision.

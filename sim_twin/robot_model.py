@@ -10,7 +10,7 @@ The shapes are the twin's own: tubes and boxes with the offsets and diameters of
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ ARM_JOINTS = tuple(f"joint_{i}" for i in range(1, 7))
 LEFT_CRANK, LEFT_FINGER = "left_crank", "left_finger"
 RIGHT_CRANK, RIGHT_FINGER = "right_crank", "right_finger"
 BASE_LINK, GRIPPER_LINK = "base", "gripper"
+SLIDE_X, SLIDE_Z = "slide_x", "slide_z"
 
 # Universal Robots, "DH parameters for calculations of kinematics and dynamics", UR5e: masses [kg] and centres of mass
 # [m] of the six links, each in its own Denavit-Hartenberg frame.
@@ -51,6 +52,9 @@ _SECOND_PIVOT = (-0.009, 0.014)
 _KNUCKLE_TO_TIP = linkage.CLOSED_LENGTH_M - _PIVOT_Z - linkage.CRANK_LENGTH_M * math.cos(linkage.CLOSED_ANGLE)
 # From the knuckle to the inner face of the finger: closed, the two faces meet in the middle.
 _KNUCKLE_TO_FACE = -(_PIVOT_X + linkage.CRANK_LENGTH_M * math.sin(linkage.CLOSED_ANGLE))
+
+# About what of an arm moves with its tool.
+_SLIDE_MASS_KG = 3.0
 
 _GREY = (196, 200, 204)
 _BLUE = (92, 152, 196)
@@ -135,18 +139,39 @@ def second_crank_frames(left_angle: float, right_angle: float) -> Array:
     )
 
 
+def finger_angles(crank_angle: float) -> dict[str, float]:
+    """Angles [rad] of the four gripper joints at a crank angle: the fingers keep their direction."""
+    return {
+        LEFT_CRANK: crank_angle,
+        RIGHT_CRANK: crank_angle,
+        LEFT_FINGER: -crank_angle,
+        RIGHT_FINGER: -crank_angle,
+    }
+
+
 def urdf() -> str:
     """The arm and its gripper as URDF: collision shapes and masses only; inertias are left to the engine."""
     lines = ['<?xml version="1.0"?>', '<robot name="ur5e_rg2">']
     lines += _urdf_link(BASE_LINK, 4.0, (0.0, 0.0, 0.0), base_parts())
     for link in links():
-        lines += _urdf_link(link.name, link.mass_kg, link.centre_m, link.parts)
-        kind = "continuous" if link.axis else "fixed"
-        axis = f'<axis xyz="{_numbers(link.axis)}"/>' if link.axis else ""
-        lines.append(
-            f'<joint name="{link.joint}" type="{kind}"><parent link="{link.parent}"/><child link="{link.name}"/>'
-            f"{_origin(link.T_parent_link)}{axis}</joint>"
-        )
+        lines += _urdf_jointed(link, "continuous" if link.axis else "fixed")
+    lines.append("</robot>")
+    return "\n".join(lines)
+
+
+def rig_urdf() -> str:
+    """The gripper alone, on two slides: along x and along z of a base that stands in the axes of the flange."""
+    lines = ['<?xml version="1.0"?>', '<robot name="rg2_rig">']
+    lines += _urdf_link(BASE_LINK, 1.0, (0.0, 0.0, 0.0), ())
+    parent = BASE_LINK
+    for joint, axis in ((SLIDE_X, (1.0, 0.0, 0.0)), (SLIDE_Z, (0.0, 0.0, 1.0))):
+        slide = Link(joint, joint, parent, np.eye(4), axis, _SLIDE_MASS_KG, (0.0, 0.0, 0.0), ())
+        lines += _urdf_jointed(slide, "prismatic")
+        parent = joint
+    for link in _gripper_links():
+        if link.name == GRIPPER_LINK:
+            link = replace(link, parent=parent, T_parent_link=np.eye(4))  # noqa: PLW2901
+        lines += _urdf_jointed(link, "continuous" if link.axis else "fixed")
     lines.append("</robot>")
     return "\n".join(lines)
 
@@ -320,6 +345,17 @@ def _urdf_link(name: str, mass: float, centre: Vector, parts: tuple[Part, ...]) 
             lines.append(f"<collision>{_origin(part.T_link_part)}<geometry>{shape}</geometry></collision>")
     lines.append("</link>")
     return lines
+
+
+def _urdf_jointed(link: Link, kind: str) -> list[str]:
+    """A link and the joint that carries it."""
+    axis = f'<axis xyz="{_numbers(link.axis)}"/>' if link.axis else ""
+    limit = '<limit lower="-2" upper="2" effort="1000" velocity="10"/>' if kind == "prismatic" else ""
+    return [
+        *_urdf_link(link.name, link.mass_kg, link.centre_m, link.parts),
+        f'<joint name="{link.joint}" type="{kind}"><parent link="{link.parent}"/><child link="{link.name}"/>'
+        f"{_origin(link.T_parent_link)}{axis}{limit}</joint>",
+    ]
 
 
 def _origin(T: Array) -> str:

@@ -305,7 +305,8 @@ def _row_objects(path: Path, rows: list[_Row], meshes: Path) -> tuple[SceneObjec
         origin = row.position - _PUBLIC_CENTRE - R_base_frame @ bounds_center(in_frame)
         T = make_transform(R_base_frame @ R_mesh_frame.T, origin)
         color = row.color or next(obstacle_colors)
-        label = color if isinstance(color, str) else "block"
+        # As the file calls it: a colour for a goal.
+        label = row.color if isinstance(row.color, str) else "block"
         rgb = PALETTE[color] if isinstance(color, str) else color
         objects.append(SceneObject(f"{label} {shape.name} line {row.number}", shape, rgb, T))
     return tuple(objects)

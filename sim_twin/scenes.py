@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Scene", "SceneObject", "make_scene", "scene_names"]
 
+# The one object of this colour is what `random-goal` and the built-in arrangements are about.
+GOAL = "red"
 # Drops scatter over a square of this half width about the centre: half of the papers' 448 mm workspace.
 DROP_HALF_WIDTH_M = 0.112
 # The lowest point of an object that is dropped onto the bare table.
@@ -40,7 +42,7 @@ _BUILT_IN = Path(__file__).parent / "scenes"
 
 def scene_names() -> list[str]:
     """The names that `make_scene` knows without a file."""
-    return ["random", "novel", *sorted(path.stem for path in _BUILT_IN.glob("*.toml"))]
+    return ["random", "random-goal", "novel", *sorted(path.stem for path in _BUILT_IN.glob("*.toml"))]
 
 
 def make_scene(
@@ -50,8 +52,8 @@ def make_scene(
 
     Args:
         name: one of `scene_names()`, or the path of a scene file (see docs/scenes.md).
-        count: number of objects of `random` and `novel`; the other scenes have their own.
-        seed: of what those two draw.
+        count: number of objects of `random`, `random-goal` and `novel`; the other scenes have their own.
+        seed: of what those three draw.
         workspace: where the scene is put.
         table_height_m: z of the table top.
         meshes: folder with the OBJ files that a scene file names.
@@ -64,9 +66,9 @@ def make_scene(
     if meshes is not None and name in scene_names():
         raise ConfigError(f"scene {name!r} has its own meshes; --meshes {meshes} belongs to a scene file")
     rng = np.random.default_rng(seed)
-    if name == "random":
+    if name in {"random", "random-goal"}:
         shapes = [block(BLOCK_NAMES[i]) for i in rng.integers(len(BLOCK_NAMES), size=count)]
-        scene = drop_scene(name, shapes, rng)
+        scene = drop_scene(name, shapes, rng, GOAL if name == "random-goal" else None)
     elif name == "novel":
         scene = drop_scene(name, novel_shapes(count, rng), rng)
     elif name in scene_names():
@@ -81,16 +83,16 @@ def make_scene(
     return place(scene, workspace, table_height_m)
 
 
-def drop_scene(name: str, shapes: Sequence[Shape], rng: np.random.Generator) -> Scene:
+def drop_scene(name: str, shapes: Sequence[Shape], rng: np.random.Generator, goal: str | None = None) -> Scene:
     """Let the shapes fall, in random colours and orientations, above a square about the scene's origin.
 
     Each object starts as low as the ones before it leave room, so that nothing starts inside another, whether
-    they are let go one after the other or all at once.
+    they are let go one after the other or all at once. With a goal exactly one of them, any, has that colour.
     """
     centres: Array = np.zeros((0, 3))
     radii: Array = np.zeros(0)
     objects = []
-    for i, (shape, color) in enumerate(zip(shapes, _colors(len(shapes), rng), strict=True)):
+    for i, (shape, color) in enumerate(zip(shapes, _colors(len(shapes), rng, goal), strict=True)):
         radius = float(np.linalg.norm(shape.mesh.vertices, axis=1).max())
         spots = rng.uniform(-DROP_HALF_WIDTH_M, DROP_HALF_WIDTH_M, size=(_DROP_CANDIDATES, 2))
         heights = [_free_height(spot, radius, centres, radii) for spot in spots]
@@ -109,11 +111,18 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _colors(count: int, rng: np.random.Generator) -> list[str]:
-    """Names of colours: shuffled decks of the ten, so that ten objects show each of them once."""
-    names = list(PALETTE)
-    decks = [rng.permutation(len(names)) for _ in range(-(-count // len(names)))]
-    return [names[i] for i in np.concatenate(decks)[:count]]
+def _colors(count: int, rng: np.random.Generator, goal: str | None) -> list[str]:
+    """Names of colours: shuffled decks of the ten, so that ten objects show each of them once.
+
+    With a goal decks of the other nine, and that colour for one object.
+    """
+    names = [name for name in PALETTE if name != goal]
+    others = count if goal is None else count - 1
+    decks = [rng.permutation(len(names)) for _ in range(-(-others // len(names)))]
+    colors = [names[i] for deck in decks for i in deck][:others]
+    if goal is not None:
+        colors.insert(rng.integers(count), goal)
+    return colors
 
 
 def _random_rotation(rng: np.random.Generator) -> Array:

@@ -40,10 +40,7 @@ _SOLVER_RESIDUAL = 1e-4
 # Half the engine's default. It also widens the boxes by which the engine finds neighbours, and all objects whose boxes
 # touch wake together: with the default the gripper wakes the whole table when it comes near one object.
 _CONTACT_BREAKING_M = 0.01
-_OBJECT_FRICTION = 0.8
 _FINGER_FRICTION = 1.0
-# Painted wood on a laminate table top, assumed; the engine multiplies the two bodies' coefficients.
-_TABLE_FRICTION = 0.6
 # Not only for what rolls: without it flat objects in a heap rock for ever and keep the whole heap awake.
 _ROLLING_FRICTION = 0.001
 _SPINNING_FRICTION = 0.002
@@ -95,6 +92,19 @@ class Visual:
 
 
 @dataclass(frozen=True)
+class Friction:
+    """Coefficients of friction; the engine multiplies those of the two bodies that touch.
+
+    Attributes:
+        objects: of painted wood (assumed).
+        table: of a laminate table top (assumed).
+    """
+
+    objects: float = 0.8
+    table: float = 0.6
+
+
+@dataclass(frozen=True)
 class Contact:
     """Where the surroundings touched arm and gripper in the last step, base axes.
 
@@ -143,9 +153,10 @@ class _Built:
 class World:
     """One cell in the engine. It exists while at least one device is attached; each life starts from the scene."""
 
-    def __init__(self, config: CellConfig, options: TwinOptions) -> None:
+    def __init__(self, config: CellConfig, options: TwinOptions, friction: Friction | None = None) -> None:
         self.config = config
         self._options = options
+        self._friction = friction or Friction()
         self._devices: list[object] = []
         self._controllers: list[Callable[[], None]] = []
         self._built: _Built | None = None
@@ -291,17 +302,7 @@ class World:
         return self._built
 
     def _build(self) -> None:
-        from sim_twin.scenes import make_scene
-
-        config, options = self.config, self._options
-        scene = make_scene(
-            options.scene,
-            options.objects,
-            options.seed,
-            config.workspace,
-            config.table.height_m,
-            options.meshes,
-        )
+        scene = self._make_scene()
         pybullet = load_pybullet()
         client = pybullet.connect(pybullet.DIRECT)
         if client < 0:
@@ -331,6 +332,14 @@ class World:
             self.close()
             raise
 
+    def _make_scene(self) -> Scene:
+        from sim_twin.scenes import make_scene
+
+        config, options = self.config, self._options
+        return make_scene(
+            options.scene, options.objects, options.seed, config.workspace, config.table.height_m, options.meshes
+        )
+
     def _load_furniture(self) -> int:
         built = self._need()
         p, client = built.engine, built.client
@@ -338,17 +347,25 @@ class World:
         for _, part in furniture(self.config):
             shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[s / 2 for s in part.size], physicsClientId=client)
             T = part.T_link_part
-            body = p.createMultiBody(0, shape, -1, T[:3, 3].tolist(), _quaternion(T), physicsClientId=client)
-            p.changeDynamics(body, -1, lateralFriction=_TABLE_FRICTION, restitution=0, physicsClientId=client)
+            body = p.createMultiBody(0, shape, -1, T[:3, 3].tolist(), quaternion(T), physicsClientId=client)
+            p.changeDynamics(body, -1, lateralFriction=self._friction.table, restitution=0, physicsClientId=client)
             bodies.append(body)
         return int(bodies[0])
 
     def _load_robot(self, table: int) -> None:
+        arm = dict(zip(robot_model.ARM_JOINTS, self.config.motion.home_q, strict=True))
+        built = self._load_machine(robot_model.urdf(), arm)
+        # The shoulder turns where the foot goes through a table that is higher than the arm's base.
+        shoulder = built.joints[robot_model.ARM_JOINTS[0]]
+        built.engine.setCollisionFilterPair(table, built.robot, -1, shoulder, 0, physicsClientId=built.client)
+
+    def _load_machine(self, urdf: str, start: dict[str, float]) -> _Built:
+        """Load what carries the gripper, with its joints at `start`, and couple the fingers, pre-shaped."""
         built = self._need()
         p, client = built.engine, built.client
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "ur5e_rg2.urdf"
-            path.write_text(robot_model.urdf(), encoding="utf-8")
+            path = Path(folder) / "machine.urdf"
+            path.write_text(urdf, encoding="utf-8")
             robot = built.robot = p.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
         count = p.getNumJoints(robot, physicsClientId=client)
         built.joints = {p.getJointInfo(robot, i, physicsClientId=client)[1].decode(): i for i in range(count)}
@@ -376,17 +393,8 @@ class World:
         for crank in (robot_model.LEFT_CRANK, robot_model.RIGHT_CRANK):
             inertia = [_CRANK_INERTIA_KG_M2] * 3
             p.changeDynamics(robot, joints[crank], localInertiaDiagonal=inertia, physicsClientId=client)
-        # The shoulder turns where the foot goes through a table that is higher than the arm's base.
-        p.setCollisionFilterPair(table, robot, -1, joints[robot_model.ARM_JOINTS[0]], 0, physicsClientId=client)
         angle = linkage.crank_angle(self.config.gripper.preshape_m)
-        start = {
-            **dict(zip(robot_model.ARM_JOINTS, self.config.motion.home_q, strict=True)),
-            robot_model.LEFT_CRANK: angle,
-            robot_model.RIGHT_CRANK: angle,
-            robot_model.LEFT_FINGER: -angle,
-            robot_model.RIGHT_FINGER: -angle,
-        }
-        for name, value in start.items():
+        for name, value in {**start, **robot_model.finger_angles(angle)}.items():
             p.resetJointState(robot, joints[name], value, physicsClientId=client)
             p.setJointMotorControl2(robot, joints[name], p.VELOCITY_CONTROL, force=0, physicsClientId=client)
         for a, b, ratio in (
@@ -399,6 +407,7 @@ class World:
                 physicsClientId=client,
             )  # fmt: skip
             p.changeConstraint(gear, gearRatio=ratio, erp=_GEAR_ERP, maxForce=_GEAR_FORCE, physicsClientId=client)
+        return built
 
     def _load_scene(self, scene: Scene) -> None:
         built = self._need()
@@ -446,14 +455,14 @@ class World:
                 collision,
                 -1,
                 T_base_object[:3, 3].tolist(),
-                _quaternion(T_base_object),
+                quaternion(T_base_object),
                 useMaximalCoordinates=True,
                 physicsClientId=client,
             )
         p.changeDynamics(
             body,
             -1,
-            lateralFriction=_OBJECT_FRICTION,
+            lateralFriction=self._friction.objects,
             rollingFriction=_ROLLING_FRICTION,
             spinningFriction=_SPINNING_FRICTION,
             restitution=0,
@@ -572,14 +581,7 @@ class World:
         entries: list[tuple[Visual, tuple[str, int]]] = []
         for kind, part in furniture(self.config):
             entries.append((_part_visual((part,), kind), ("fixed", 0)))
-        for group in _by_color(robot_model.base_parts()):
-            entries.append((_part_visual(group, "arm"), ("fixed", 0)))
-        for link in robot_model.links():
-            index = built.joints[link.joint]
-            body: Kind = "gripper" if index >= built.joints["flange"] else "arm"
-            entries += [(_part_visual(group, body), ("link", index)) for group in _by_color(link.parts)]
-        for side in (0, 1):
-            entries.append((_part_visual(robot_model.second_crank_parts(), "gripper"), ("second crank", side)))
+        entries += self._robot_visuals()
         for i, item in enumerate(built.scene_objects):
             mesh = item.shape.mesh
             color = np.array(item.color, dtype=np.uint8)
@@ -589,7 +591,23 @@ class World:
         built.carriers = tuple(carrier for _, carrier in entries)
 
 
-def _quaternion(T: Array) -> list[float]:
+    def _robot_visuals(self) -> list[tuple[Visual, tuple[str, int]]]:
+        """The arm and its gripper, each with the frame that carries it."""
+        joints = self._need().joints
+        entries: list[tuple[Visual, tuple[str, int]]] = []
+        for group in _by_color(robot_model.base_parts()):
+            entries.append((_part_visual(group, "arm"), ("fixed", 0)))
+        for link in robot_model.links():
+            index = joints[link.joint]
+            body: Kind = "gripper" if index >= joints["flange"] else "arm"
+            entries += [(_part_visual(group, body), ("link", index)) for group in _by_color(link.parts)]
+        for side in (0, 1):
+            entries.append((_part_visual(robot_model.second_crank_parts(), "gripper"), ("second crank", side)))
+        return entries
+
+
+def quaternion(T: Array) -> list[float]:
+    """(x, y, z, w) of the rotation of a transform (4, 4)."""
     return [float(v) for v in Rotation.from_matrix(T[:3, :3]).as_quat()]
 
 

@@ -8,7 +8,6 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -16,6 +15,7 @@ from scipy.stats import rankdata
 from torch.nn import functional
 
 from policy.encoding import encode
+from policy.selection import push_mask
 from policy.training.augment import augment
 from policy.training.shard import GRASP, PUSH, unpack_height
 
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from policy.training.config import LearningSettings
     from policy.training.replay import Replay, Sample, View
 
-# A push may start beside an object (paper's code: 15 dilations with a 3 x 3 element, 30 mm).
-_PUSH_MARGIN_CELLS = 15
 _VALIDATION_BATCH = 8
 
 
@@ -139,7 +137,7 @@ class Learner:
     def targets(self, samples: Sequence[Sample]) -> Tensor:
         """(N,) float32 of all attempts in their order: y = r + gamma Q_target(s', argmax_a Q_online(s', a)).
 
-        The maximum runs over grasps at the object (stage 1: at all objects) and pushes that start within 30 mm of it.
+        The maximum runs over grasps at the object (stage 1: at all objects) and pushes of what is within 30 mm of it.
         y = r where the attempt ended its episode or nothing is left to act on.
         """
         targets = torch.from_numpy(np.concatenate([sample.reward for sample in samples])).float()
@@ -158,10 +156,11 @@ class Learner:
                 view = first_view + int(sample.following[i])
                 goal = int(sample.target[i]) if self._stage == 2 else 0
                 if (view, goal) not in values:
-                    labels = views[view].labels
-                    mask = labels == goal if goal else labels > 0
                     values[view, goal] = _double_q(
-                        tuple(maps[view].float() for maps in online), tuple(maps[view].float() for maps in target), mask
+                        tuple(maps[view].float() for maps in online),
+                        tuple(maps[view].float() for maps in target),
+                        views[view].labels,
+                        goal,
                     )
                 targets[first_attempt + i] += self._settings.gamma * values[view, goal]
             first_attempt += len(sample.reward)
@@ -236,21 +235,24 @@ def _mean(values: npt.NDArray[np.float32]) -> float:
     return float(values.mean()) if len(values) else math.nan
 
 
-def _double_q(online: tuple[Tensor, ...], target: tuple[Tensor, ...], mask: npt.NDArray[np.bool_]) -> float:
-    """Q_target of the action that Q_online likes best: grasps in the mask, pushes in the mask dilated; 0 if empty.
+def _double_q(
+    online: tuple[Tensor, ...], target: tuple[Tensor, ...], labels: npt.NDArray[np.uint8], goal: int
+) -> float:
+    """Q_target of the action that Q_online likes best among those that concern the goal; 0 if it is not seen.
 
     Args:
         online: Q maps of grasps and pushes of one state, (planes, H, W) each.
         target: the same of the target network.
-        mask: (H, W).
+        labels: (H, W) of the objects.
+        goal: label of the goal; 0 for any object.
     """
+    objects = labels > 0
+    mask = labels == goal if goal else objects
     if not mask.any():
         return 0.0
-    side = 2 * _PUSH_MARGIN_CELLS + 1
-    near = cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
     device = online[0].device
     best, value = -math.inf, 0.0
-    for online_maps, target_maps, cells in zip(online, target, (mask, near), strict=True):
+    for online_maps, target_maps, cells in zip(online, target, (mask, push_mask(mask, objects)), strict=True):
         flat = torch.from_numpy(np.flatnonzero(cells)).to(device)
         candidates = online_maps.flatten(1)[:, flat].flatten()
         choice = int(candidates.argmax())

@@ -1,0 +1,99 @@
+"""Where a push begins: a cell of the push maps is what is pushed, and the fingers come down behind it.
+
+The paper's cell is the start itself. Here it is the place on an object through which the push passes, so that the
+goal's mask selects pushes of the goal also where neighbours leave no room for the fingers beside it; the start follows
+from the heightmap.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from robotcell.decision import ROTATIONS
+
+if TYPE_CHECKING:
+    from robotcell.config import Workspace
+
+# Room that the closed fingers need to come down: half their diagonal, and 1 mm for noise and calibration.
+_FREE_RADIUS_M = 0.016
+# What stands higher than this is in their way.
+_FREE_HEIGHT_M = 0.008
+# The push must still go on for this far behind the cell that it was chosen for.
+_FOLLOW_M = 0.010
+# The height of what is met is taken over so much of its face: the first cells of an edge are uncertain.
+_FACE_M = 0.014
+_OBJECT_M = 0.010
+
+
+@dataclass(frozen=True)
+class PushLine:
+    """A push through a cell.
+
+    Attributes:
+        row, col: cell where the closed fingers come down.
+        top_m: height of what they meet first [m above the table].
+        cells: (N, 2) row and column of every cell on the way of the finger tips, from the start on.
+    """
+
+    row: int
+    col: int
+    top_m: float
+    cells: npt.NDArray[np.intp]
+
+
+def free_to_descend(height_m: npt.NDArray[np.float32], workspace: Workspace) -> npt.NDArray[np.bool_]:
+    """(H, W) cells at which the closed fingers come down on nothing: all around is seen and low.
+
+    Args:
+        height_m: (H, W) with closed gaps, NaN where nothing was seen.
+        workspace: for the size of its cells.
+    """
+    with np.errstate(invalid="ignore"):
+        blocked = ~(height_m < _FREE_HEIGHT_M)
+    size = 2 * math.ceil(_FREE_RADIUS_M / workspace.resolution_m) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    # Beyond the map nothing is known.
+    grown = cv2.dilate(blocked.astype(np.uint8), disc, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    return np.asarray(grown == 0)
+
+
+def push_line(
+    height_m: npt.NDArray[np.float32],
+    free: npt.NDArray[np.bool_],
+    cell: tuple[int, int],
+    rotation: int,
+    push_m: float,
+    resolution_m: float,
+) -> PushLine | None:
+    """The push of length `push_m` in direction `rotation` through a cell; None where there is none.
+
+    Going back from the cell, the fingers come down at the first place that is free for them.
+    """
+    theta = 2 * math.pi * rotation / ROTATIONS
+    direction = np.array([math.sin(theta), math.cos(theta)])  # rows run along y, columns along x
+    length = round(push_m / resolution_m)
+    back = np.arange(length - round(_FOLLOW_M / resolution_m) + 1)
+    rows, cols = np.rint(np.array(cell)[:, None] - direction[:, None] * back).astype(np.intp)
+    inside = (rows >= 0) & (rows < free.shape[0]) & (cols >= 0) & (cols < free.shape[1])
+    if not inside.all():
+        end = int(inside.argmin())
+        rows, cols = rows[:end], cols[:end]
+    starts = np.flatnonzero(free[rows, cols])
+    if not len(starts):
+        return None
+    start = np.array([rows[starts[0]], cols[starts[0]]])
+    way = np.rint(start[:, None] + direction[:, None] * np.arange(length + 1)).astype(np.intp)
+    inside = ((way >= 0) & (way < np.array(free.shape)[:, None])).all(axis=0)
+    cells = way[:, : int(inside.argmin()) if not inside.all() else len(inside)].T
+    profile = np.nan_to_num(height_m[cells[:, 0], cells[:, 1]], nan=0.0)
+    met = np.flatnonzero(profile > _OBJECT_M)
+    if not len(met):
+        return None
+    face = profile[met[0] : met[0] + round(_FACE_M / resolution_m)]
+    return PushLine(int(start[0]), int(start[1]), float(face.max()), cells)

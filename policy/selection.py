@@ -1,0 +1,80 @@
+"""From Q maps to an action: masks, the goal as selector, and the guards.
+
+Paper, section "The problem": goal-agnostic Q maps are the raw ones times the objects' mask; the goal's mask selects from
+them (Hadamard product), dilated for pushes; the action is the argmax.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from policy.push_line import PushLine, push_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+# Paper: 15 dilations of 3x3.
+DILATIONS = 15
+# Cells of the push maps that are tried in the order of their value before pushing is given up.
+_PUSH_TRIES = 200
+# Maps whose values differ by less than this say nothing.
+_FLAT = 1e-6
+
+
+class BadMapsError(ValueError):
+    """The network's output cannot be acted upon."""
+
+
+def check_maps(q: npt.NDArray[np.float32], name: str) -> None:
+    """Refuse Q maps (K, H, W) that are empty, not finite, or the same everywhere.
+
+    Raises:
+        BadMapsError: they are.
+    """
+    if q.ndim != 3 or not q.size:
+        raise BadMapsError(f"the {name} maps are empty: shape {q.shape}")
+    if not np.isfinite(q).all():
+        raise BadMapsError(f"the {name} maps hold {np.count_nonzero(~np.isfinite(q))} values that are not finite")
+    if np.ptp(q) < _FLAT:
+        raise BadMapsError(f"the {name} maps are flat: every value is {float(q.flat[0]):.4g}")
+
+
+def push_mask(targets: npt.NDArray[np.bool_], objects: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(H, W) cells whose pushes concern the targets: on an object, within 15 cells of them."""
+    grown = cv2.dilate(targets.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=DILATIONS) > 0
+    return np.asarray(grown & objects)
+
+
+def best_cells(
+    q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], count: int
+) -> Iterator[tuple[int, int, int, float]]:
+    """(rotation, row, col, Q) of the `count` largest values inside a mask (H, W) or (K, H, W), the largest first."""
+    inside = np.flatnonzero(np.broadcast_to(mask, q.shape))
+    values = q.ravel()[inside]
+    if len(values) > count:
+        largest = np.argpartition(values, -count)[-count:]
+        inside, values = inside[largest], values[largest]
+    for i in np.argsort(-values, kind="stable"):
+        k, row, col = np.unravel_index(inside[i], q.shape)
+        yield int(k), int(row), int(col), float(values[i])
+
+
+def best_push(
+    q: npt.NDArray[np.float32],
+    mask: npt.NDArray[np.bool_],
+    height_m: npt.NDArray[np.float32],
+    free: npt.NDArray[np.bool_],
+    push_m: float,
+    resolution_m: float,
+) -> tuple[int, int, int, float, PushLine] | None:
+    """The push of largest value that has a place to begin: rotation, row, col, Q, and its line."""
+    # Neighbouring cells share their start: looking at a coarse raster spreads the tries.
+    for k, row, col, value in best_cells(q, mask, _PUSH_TRIES):
+        line = push_line(height_m, free, (row, col), k, push_m, resolution_m)
+        if line is not None:
+            return k, row, col, value, line
+    return None

@@ -1,0 +1,285 @@
+"""A rollout worker: plays scenes, tries several actions in every state, and keeps what came of them.
+
+In each state the saved world is put back after every attempt, so one rendered picture yields a dozen labels: what the
+network would do (for any object, and for one object as goal), near misses of it, and what it would not do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from policy.grasping import Jaw, find_grasps, lay_table
+from policy.push_line import push_line
+from policy.selection import best_cells, push_mask
+from policy.surface import estimate_surface
+from policy.training.environment import GRASP, PUSH, Outcome, PushGraspEnv, State, Trial
+from policy.training.shard import Shard, pack_height
+from robotcell.config import load_config
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from policy.training.config import CollectSettings
+    from robotcell.config import CellConfig
+
+# Of the attempts that exploit, a share takes the best action; the others one of so many of the best.
+_GREEDY_SHARE = 0.4
+_AMONG_BEST = 300
+# A cell for a push is drawn at most so often.
+_PUSH_TRIES = 25
+# Where no network decides yet: this share of the grasps is drawn from those that look possible.
+_GEOMETRIC_SHARE = 0.5
+# A state whose best grasp succeeds is left by it, or by a push with this probability (stage I, stage II).
+_LEAVE_BY_PUSH = (0.15, 0.35)
+# Stage I: about ten objects, dropped, as the paper has it; or a group. Stage II: thirty, or a group.
+_KINDS = {
+    1: (("drop", 6, 14, 0.7), ("packed", 4, 10, 0.3)),
+    2: (("drop", 20, 30, 0.4), ("packed", 4, 12, 0.6)),
+}
+
+
+@dataclass(frozen=True)
+class Collection:
+    """What a worker is asked for.
+
+    Attributes:
+        stage: 1 or 2.
+        seeds: of the scenes to play.
+        weights: of the network; None explores without one.
+        exploration: share of the attempts that explore.
+        settings: how many attempts in a state, and how many states of a scene.
+    """
+
+    stage: int
+    seeds: tuple[int, ...]
+    weights: Path | None
+    exploration: float
+    settings: CollectSettings
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """Q maps of a state; None where no network decides."""
+
+    grasp: npt.NDArray[np.float32]
+    push: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Choice:
+    primitive: int
+    rotation: int
+    cell: tuple[int, int]
+    greedy: bool = False
+
+
+@dataclass
+class _Book:
+    """A shard in the making."""
+
+    states: list[State] = field(default_factory=list)
+    scenes: list[int] = field(default_factory=list)
+    rows: list[tuple[int, int, int, int, int, int, float, float, int, bool, int]] = field(default_factory=list)
+
+    def add_state(self, state: State, scene: int) -> int:
+        self.states.append(state)
+        self.scenes.append(scene)
+        return len(self.states) - 1
+
+    def add_trial(self, state: int, choice: _Choice, trial: Trial) -> None:
+        after = -1
+        if trial.after is not None and any(goes_on for *_, goes_on in trial.rows):
+            after = self.add_state(trial.after, self.scenes[state])
+        for (row, col), target, (agnostic, goal), goes_on in trial.rows:
+            self.rows.append(
+                (state, choice.primitive, row, col, choice.rotation, target, agnostic, goal)
+                + (after if goes_on else -1, choice.greedy, int(trial.outcome))
+            )
+
+    def shard(self) -> Shard:
+        column = list(zip(*self.rows, strict=True)) or [()] * 11
+        return Shard(
+            height=np.stack([pack_height(s.heightmap.height_m) for s in self.states]),
+            color=np.stack([s.heightmap.color for s in self.states]),
+            labels=np.stack([s.labels for s in self.states]),
+            scene=np.array(self.scenes, np.int32),
+            state=np.array(column[0], np.int32),
+            primitive=np.array(column[1], np.int8),
+            row=np.array(column[2], np.int16),
+            col=np.array(column[3], np.int16),
+            rotation=np.array(column[4], np.int8),
+            target=np.array(column[5], np.int16),
+            reward=np.array([column[6], column[7]], np.float32).T.reshape(-1, 2),
+            next_state=np.array(column[8], np.int32),
+            greedy=np.array(column[9], np.bool_),
+            outcome=np.array(column[10], np.int8),
+        )
+
+
+def collect(collection: Collection) -> Shard:
+    """Play the scenes; the same collection gives the same shard.
+
+    Raises:
+        ConfigError: the weights cannot be read, or a scene cannot be made.
+    """
+    config = load_config(None, {})
+    network = None
+    if collection.weights is not None:
+        from policy.inference import Inference
+
+        network = Inference.load(collection.weights)
+    book = _Book()
+    env = PushGraspEnv(config, collection.stage)
+    try:
+        for seed in collection.seeds:
+            rng = np.random.default_rng([seed, 1])
+            kinds = _KINDS[collection.stage]
+            kind, low, high, _ = kinds[int(rng.choice(len(kinds), p=[share for *_, share in kinds]))]
+            env.reset(seed=seed, options={"kind": kind, "count": int(rng.integers(low, high + 1))})
+            _play(env, seed, collection, network, config, rng, book)
+    finally:
+        env.close()
+    return book.shard()
+
+
+def _play(
+    env: PushGraspEnv,
+    seed: int,
+    collection: Collection,
+    network: Inference | None,
+    config: CellConfig,
+    rng: np.random.Generator,
+    book: _Book,
+) -> None:
+    settings = collection.settings
+    known: int | None = None
+    for _ in range(settings.states):
+        state = env.state
+        if not state.occupied:
+            return
+        # A state that a push led to is in the book already.
+        here = known if known is not None else book.add_state(state, seed)
+        known = None
+        maps = None
+        if network is not None:
+            grasp, push = network.maps(state.heightmap.height_m, state.heightmap.color)
+            maps = _Maps(grasp, push)
+        picks: list[_Choice] = []
+        useful: list[_Choice] = []
+        for choice in _choices(state, maps, collection, config, rng):
+            trial = env.attempt(choice.primitive, choice.rotation, choice.cell)
+            book.add_trial(here, choice, trial)
+            if trial.held:
+                picks.append(choice)
+            elif trial.outcome is Outcome.PUSHED:
+                useful.append(choice)
+        leave_by_push = useful and (not picks or rng.random() < _LEAVE_BY_PUSH[collection.stage - 1])
+        candidates = useful if leave_by_push else picks
+        if not candidates:
+            return
+        choice = candidates[int(rng.integers(len(candidates)))]
+        trial = env.advance(choice.primitive, choice.rotation, choice.cell)
+        book.add_trial(here, choice, trial)
+        if book.states[-1] is trial.after:
+            known = len(book.states) - 1
+
+
+def _choices(
+    state: State, maps: _Maps | None, collection: Collection, config: CellConfig, rng: np.random.Generator
+) -> Iterator[_Choice]:
+    """What is tried in a state."""
+    settings = collection.settings
+    objects = state.labels > 0
+    geometric = _geometric(state, config, rng) if maps is None else None
+    present = list(state.occupied)
+    for i in range(settings.grasps):
+        explore = maps is None or rng.random() < collection.exploration
+        if maps is not None and not explore:
+            # The first for any object, as in pick-all; the others with one object as the goal.
+            mask = objects if i == 0 else state.labels == present[int(rng.integers(len(present)))]
+            yield _best_grasp(maps.grasp, mask, rng)
+        elif geometric and rng.random() < _GEOMETRIC_SHARE:
+            yield geometric[int(rng.integers(len(geometric)))]
+        else:
+            yield _Choice(GRASP, int(rng.integers(8)), _random_cell(objects, rng))
+    weights = np.array([0.1 + state.occupied[label] for label in present])
+    for _ in range(settings.pushes):
+        # Objects that others stand around are what pushes are for.
+        target = state.labels == present[int(rng.choice(len(present), p=weights / weights.sum()))]
+        mask = push_mask(target, objects)
+        explore = maps is None or rng.random() < collection.exploration
+        if maps is not None and not explore:
+            yield from _best_push(state, maps.push, mask, config, rng)
+        else:
+            yield from _random_push(state, mask, config, rng)
+
+
+def _pick(primitive: int, q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> _Choice:
+    greedy = rng.random() < _GREEDY_SHARE
+    best = list(best_cells(q, mask, 1 if greedy else _AMONG_BEST))
+    k, row, col, _ = best[int(rng.integers(len(best)))]
+    return _Choice(GRASP, k, (row, col), greedy)
+
+
+def _best_push(
+    state: State, q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], config: CellConfig, rng: np.random.Generator
+) -> Iterator[_Choice]:
+    """One of the best pushes, after the best cell if that has no place to begin: the network is to learn that too."""
+    greedy = rng.random() < _GREEDY_SHARE
+    best = list(best_cells(q, mask, _AMONG_BEST))
+    for n, i in enumerate(range(len(best)) if greedy else rng.permutation(len(best))):
+        k, row, col, _ = best[i]
+        possible = _has_start(state, (row, col), k, config)
+        if possible or n == 0:
+            yield _Choice(PUSH, k, (row, col), greedy)
+        if possible:
+            return
+
+
+def _random_push(
+    state: State, mask: npt.NDArray[np.bool_], config: CellConfig, rng: np.random.Generator
+) -> Iterator[_Choice]:
+    """A push, after one that has no place to begin if such a one is drawn first."""
+    for n in range(_PUSH_TRIES):
+        cell, k = _random_cell(mask, rng), int(rng.integers(16))
+        possible = _has_start(state, cell, k, config)
+        if possible or n == 0:
+            yield _Choice(PUSH, k, cell)
+        if possible:
+            return
+
+
+def _has_start(state: State, cell: tuple[int, int], rotation: int, config: CellConfig) -> bool:
+    resolution, length = config.workspace.resolution_m, config.motion.push_m
+    return push_line(state.height_m, state.free, cell, rotation, length, resolution) is not None
+
+
+def _random_cell(mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> tuple[int, int]:
+    cells = np.flatnonzero(mask)
+    row, col = np.unravel_index(cells[int(rng.integers(len(cells)))], mask.shape)
+    return int(row), int(col)
+
+
+def _geometric(state: State, config: CellConfig, rng: np.random.Generator) -> list[_Choice]:
+    """Grasps that look possible, the better ones more often."""
+    surface = estimate_surface(state.heightmap, config.camera.pose()[:3, 3], config.table.height_m)
+    jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+    resolution = config.workspace.resolution_m
+    found = find_grasps(
+        lay_table(surface, state.labels.astype(np.int32), resolution, jaw.opening_m), state.labels > 0, jaw
+    )
+    likely = np.flatnonzero(found.score > 0)
+    if not len(likely):
+        return []
+    weights = found.score[likely].astype(np.float64)
+    drawn = rng.choice(likely, size=50, p=weights / weights.sum())
+    return [_Choice(GRASP, int(found.rotation[i]), (int(found.row[i]), int(found.col[i]))) for i in drawn]
+
+
+if TYPE_CHECKING:
+    from policy.inference import Inference

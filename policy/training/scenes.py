@@ -1,0 +1,144 @@
+"""Scenes to learn from: drops and packed groups of blocks, scaled and shaped at random.
+
+None of them is a scene of the benchmark: those are drawn from other seeds, or built in by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robotcell.geometry import make_transform
+from robotcell.palette import PALETTE
+from sim_twin.meshes import Mesh, hull
+from sim_twin.novel import resting_poses
+from sim_twin.scene import Scene, SceneObject, place
+from sim_twin.scenes import DROP_HALF_WIDTH_M, drop_scene
+from sim_twin.shapes import BLOCK_NAMES, Shape, block, shape_of
+
+if TYPE_CHECKING:
+    from robotcell.config import CellConfig
+    from robotcell.geometry import Array
+
+# Shares of objects: a block as it is, a block scaled along each axis, and another solid.
+_PLAIN, _SCALED = 0.6, 0.25
+_SCALES = (0.75, 1.15)
+_DENSITY_KG_M3 = (250.0, 700.0)
+# Widths of a group's gaps: flush, or a little apart.
+_GAPS_M = (0.0005, 0.006)
+# A group of at most so many rows and columns.
+_ROWS = (2, 4)
+_LARGEST_M = 0.075
+
+
+def training_scene(kind: str, count: int, config: CellConfig, rng: np.random.Generator) -> Scene:
+    """A scene of `count` objects.
+
+    Args:
+        kind: "drop", objects that fall one after the other; or "packed", a group that stands side by side, and the rest
+            of the objects dropped beside and onto it.
+        count: number of objects.
+        config: of the cell, for workspace and table.
+        rng: everything is drawn from it.
+    """
+    shapes = [_random_shape(rng) for _ in range(count)]
+    if kind == "drop":
+        scene = _recolored(drop_scene("training drop", shapes, rng), rng)
+    else:
+        scene = _recolored(Scene("training group", tuple(_group(shapes, rng)), drop=False), rng)
+    return place(scene, config.workspace, config.table.height_m)
+
+
+def _random_shape(rng: np.random.Generator) -> Shape:
+    draw = rng.random()
+    shape = block(BLOCK_NAMES[rng.integers(len(BLOCK_NAMES))])
+    if draw > _PLAIN + _SCALED:
+        shape = _solid(rng)
+    elif draw > _PLAIN:
+        shape = _scaled(shape, rng.uniform(*_SCALES, size=3))
+    return replace(shape, density_kg_m3=float(rng.uniform(*_DENSITY_KG_M3)))
+
+
+def _scaled(shape: Shape, scale: Array) -> Shape:
+    mesh = Mesh(shape.mesh.vertices * scale, shape.mesh.triangles)
+    parts = tuple(Mesh(part.vertices * scale, part.triangles) for part in shape.parts)
+    return Shape(f"scaled {shape.name}", mesh, parts, shape.density_kg_m3, shape.volume_m3 * float(scale.prod()))
+
+
+def _solid(rng: np.random.Generator) -> Shape:
+    """A convex solid, or two boxes that cross or meet."""
+    if rng.random() < 0.5:
+        size = rng.uniform((0.03, 0.03, 0.02), (0.09, 0.06, 0.05))
+        points = rng.normal(size=(14, 3))
+        points *= size / 2 / np.linalg.norm(points, axis=1, keepdims=True)
+        return shape_of("pebble", (hull(points),))
+    long, thin = rng.uniform(0.05, 0.10), rng.uniform(0.02, 0.035)
+    wide, high = rng.uniform(0.04, 0.07), rng.uniform(0.02, 0.05)
+    at = rng.uniform(-0.5, 0.5) * (long - thin)
+    bar = _box((0.0, 0.0, 0.0), (long, thin, high))
+    arm = _box((at, thin / 2 + wide / 4, 0.0), (thin, wide / 2, high))
+    return shape_of("angle", (bar, arm))
+
+
+def _box(center: tuple[float, float, float], size: tuple[float, float, float]) -> Mesh:
+    corners = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    return hull(corners * np.array(size) + np.array(center))
+
+
+def _group(shapes: list[Shape], rng: np.random.Generator) -> list[SceneObject]:
+    """Blocks that stand in rows, side by side, the group turned and moved about as a whole."""
+    rows = int(rng.integers(_ROWS[0], min(_ROWS[1], max(_ROWS[0], len(shapes) // 2)) + 1))
+    per_row = -(-len(shapes) // rows)
+    boxes: list[tuple[Shape, Array, Array]] = []
+    for shape in shapes:
+        turn = _resting(shape, rng)
+        vertices = shape.mesh.vertices @ turn.T
+        boxes.append((shape, turn, np.array([vertices.min(axis=0), vertices.max(axis=0)])))
+    placed: list[tuple[Shape, Array]] = []
+    y = 0.0
+    for r in range(rows):
+        members = boxes[r * per_row : (r + 1) * per_row]
+        depth = max((high[1] - low[1] for _, _, (low, high) in members), default=0.0)
+        x = float(rng.uniform(-0.02, 0.02))
+        for shape, turn, (low, high) in members:
+            position = np.array([x - low[0], y - low[1] + rng.uniform(0, depth - (high[1] - low[1])), -low[2] + 0.0005])
+            placed.append((shape, make_transform(turn, position)))
+            x += high[0] - low[0] + rng.uniform(*_GAPS_M)
+        y += depth + rng.uniform(*_GAPS_M)
+    middle = np.mean([T[:2, 3] for _, T in placed], axis=0)
+    shift = rng.uniform(-0.5, 0.5, size=2) * DROP_HALF_WIDTH_M
+    turned = make_transform(Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix(), (*shift, 0.0))
+    centred = make_transform(np.eye(3), (-middle[0], -middle[1], 0.0))
+    return [
+        SceneObject(f"{shape.name} {i + 1}", shape, (0, 0, 0), turned @ centred @ T)
+        for i, (shape, T) in enumerate(placed)
+    ]
+
+
+def _resting(shape: Shape, rng: np.random.Generator) -> Array:
+    """Rotation (3, 3) that lays the shape on one of its stable faces, its sides along the axes where it has any."""
+    poses = list(resting_poses(shape))
+    down = poses[rng.integers(len(poses))].down
+    to_table, _ = Rotation.align_vectors([[0.0, 0.0, -1.0]], [down])
+    flat = to_table.apply(shape.mesh.vertices)
+    # The quarter turn apart, the direction in which the outline is smallest.
+    angles = np.radians(np.arange(0, 90, 3))
+    areas = [np.prod(np.ptp(Rotation.from_euler("z", a).apply(flat)[:, :2], axis=0)) for a in angles]
+    aligned = Rotation.from_euler("z", angles[int(np.argmin(areas))] + rng.integers(4) * np.pi / 2)
+    return np.asarray((aligned * to_table).as_matrix())
+
+
+def _recolored(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Random colours: of the palette with a drift, or any."""
+    names = list(PALETTE)
+    objects = []
+    for item in scene.objects:
+        base = (
+            np.array(PALETTE[names[rng.integers(len(names))]], float) if rng.random() < 0.7 else rng.uniform(0, 255, 3)
+        )
+        color = np.clip(base + rng.normal(0, 12, 3), 0, 255).astype(int)
+        objects.append(replace(item, color=(int(color[0]), int(color[1]), int(color[2]))))
+    return Scene(scene.name, tuple(objects), scene.drop)
