@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import pickle
 import signal
+import socket
 import sys
 import traceback
 from itertools import islice
@@ -36,6 +37,7 @@ _ONE_THREAD = dict.fromkeys(
 )
 # What a worker has to leave its task's `with` blocks once it was told to end.
 _GRACE_S = 10.0
+_REACH_S = 5.0
 
 
 def run_tasks(
@@ -205,6 +207,7 @@ def _on_ray(
     except ImportError as error:
         raise ConfigError(f"Ray cannot be imported ({error}): pip install 'robotcell[train]'") from error
     local = address == "local"
+    _check_reachable(address)
     try:
         ray.init(
             address=address,
@@ -234,3 +237,14 @@ def _on_ray(
             yield index, _result(index, reply)
     finally:
         ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Ray itself tries an address at which nothing listens for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=_REACH_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"no Ray cluster answers at {address!r} ({error}): check the address") from error

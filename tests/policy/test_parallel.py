@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -142,3 +143,12 @@ def test_ray_gives_the_same_results() -> None:
     pytest.importorskip("ray")
     completed = subprocess.run([sys.executable, "-c", RAY], capture_output=True, text=True, check=False)
     assert completed.stdout.endswith("done\n"), completed.stderr
+
+
+def test_a_ray_address_at_which_nothing_listens_is_refused_at_once() -> None:
+    pytest.importorskip("ray")
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+        port = server.getsockname()[1]
+    for address in (f"127.0.0.1:{port}", f"ray://127.0.0.1:{port}"):
+        with pytest.raises(ConfigError, match="no Ray cluster answers"):
+            next(run_tasks(square, [1], 1, address))

@@ -113,6 +113,16 @@ def test_ten_objects_show_each_colour_once_and_thirty_three_times():
         assert {colors.count(color) for color in PALETTE.values()} == {times}
 
 
+def test_a_random_goal_is_the_one_red_object_anywhere_in_the_heap():
+    scenes = [made("random-goal", 30, seed) for seed in range(8)]
+    for scene in scenes:
+        colors = [item.color for item in scene.objects]
+        assert colors.count(PALETTE["red"]) == 1
+        assert {3, 4} >= {colors.count(color) for name, color in PALETTE.items() if name != "red"}
+    assert len({goal_of(scene.objects) for scene in scenes}) > 4
+    assert [item.color for item in made("random-goal", 1).objects] == [PALETTE["red"]]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_drop_starts_over_the_middle_of_the_workspace_and_clear_of_itself(seed):
     scene = made("random", 30, seed, table=0.05)
@@ -135,7 +145,7 @@ def test_the_same_seed_makes_the_same_drop_and_another_seed_another():
 
 
 def test_there_are_ten_challenging_scenes():
-    assert scene_names() == ["random", "novel", *CHALLENGING]
+    assert scene_names() == ["random", "random-goal", "novel", *CHALLENGING]
 
 
 @pytest.mark.parametrize("name", CHALLENGING)
@@ -207,7 +217,7 @@ def test_a_path_names_a_scene_file(tmp_path):
 
 
 def test_an_unknown_scene_is_refused_with_the_list():
-    with pytest.raises(ConfigError, match=r"'chaos'; there are random, novel, challenging-01.*path of a file"):
+    with pytest.raises(ConfigError, match=r"'chaos'; there are random, random-goal, novel, challenging-01.*path of a file"):
         made("chaos")
 
 
