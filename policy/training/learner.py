@@ -85,7 +85,9 @@ class Learner:
         rng = np.random.default_rng([self._seed, self._stage, self.updates])
         beta = settings.priority_beta_start + (1 - settings.priority_beta_start) * self.progress
         indices, weights = replay.draw(settings.batch, beta, rng)
-        samples = [augment(replay.sample(int(index), settings.next_states, rng), rng) for index in indices]
+        samples = [
+            augment(replay.sample(int(index), settings.next_states, rng), settings.crop_cells, rng) for index in indices
+        ]
         losses, errors = self.learn(samples, weights)
         known = ~np.isnan(errors)
         replay.update(indices[known], errors[known])
