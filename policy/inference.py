@@ -28,7 +28,8 @@ class Inference:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        self._network = network.eval().to(memory_format=torch.channels_last)
+        self._network = network.eval()
+        self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     @staticmethod
     def load(path: Path) -> Inference:

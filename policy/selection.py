@@ -1,7 +1,7 @@
 """From Q maps to an action: masks, the goal as selector, and the guards.
 
-Paper, section "The problem": goal-agnostic Q maps are the raw ones times the objects' mask; the goal's mask selects from
-them (Hadamard product), dilated for pushes; the action is the argmax.
+Paper, section "The problem": goal-agnostic Q maps are the raw ones times the objects' mask; the goal's mask selects
+from them (Hadamard product), dilated for pushes; the action is the argmax.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # Paper: 15 dilations of 3x3.
 DILATIONS = 15
 # Cells of the push maps that are tried in the order of their value before pushing is given up.
-_PUSH_TRIES = 200
+_PUSH_TRIES = 2000
 # Maps whose values differ by less than this say nothing.
 _FLAT = 1e-6
 
@@ -63,18 +63,29 @@ def best_cells(
         yield int(k), int(row), int(col), float(values[i])
 
 
-def best_push(
+def pushes(
     q: npt.NDArray[np.float32],
     mask: npt.NDArray[np.bool_],
     height_m: npt.NDArray[np.float32],
     free: npt.NDArray[np.bool_],
     push_m: float,
     resolution_m: float,
-) -> tuple[int, int, int, float, PushLine] | None:
-    """The push of largest value that has a place to begin: rotation, row, col, Q, and its line."""
-    # Neighbouring cells share their start: looking at a coarse raster spreads the tries.
+) -> Iterator[tuple[int, float, PushLine]]:
+    """Pushes through cells of a mask that have a place to begin, the most valuable first: rotation, Q, line."""
     for k, row, col, value in best_cells(q, mask, _PUSH_TRIES):
         line = push_line(height_m, free, (row, col), k, push_m, resolution_m)
         if line is not None:
-            return k, row, col, value, line
-    return None
+            yield k, value, line
+
+
+def surface_at(height_m: npt.NDArray[np.float32], cell: tuple[int, int]) -> float:
+    """Height [m] of the surface at a cell: the median of 5 x 5, unknown cells left out.
+
+    Args:
+        height_m: (H, W) with closed gaps, NaN = unknown.
+        cell: row and column.
+    """
+    row, col = cell
+    around = height_m[max(0, row - 2) : row + 3, max(0, col - 2) : col + 3]
+    known = around[np.isfinite(around)]
+    return float(np.median(known)) if known.size else 0.0

@@ -162,11 +162,13 @@ def push_height(surface_m: float, config: CellConfig) -> float:
 def near_height(
     heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float, tcp_z: float, config: CellConfig
 ) -> float:
-    """z of the tcp [m] at which the guarded part of a descent to `tcp_z` begins.
+    """The z of the tcp [m] at which the guarded part of a descent to `tcp_z` begins.
 
     Args:
         heightmap: what is known of the surroundings.
-        x, y, theta: where the tool comes down, and how it is turned [m, rad].
+        x: where the tool comes down [m].
+        y: likewise.
+        theta: how the tool is turned about base z [rad].
         opening_m: of the fingers, whose tips draw back as they open.
         tcp_z: z of the tcp at the end of the descent [m].
         config: of the cell.

@@ -108,7 +108,8 @@ class RigWorld(World):
         """Come down at (x, y), close along theta, lift and swing.
 
         Args:
-            x, y: where [m].
+            x: where [m].
+            y: likewise.
             theta: closing direction about base z [rad].
             near_z: height of the tcp [m] at which the descent begins.
             tcp_z: at which it ends.

@@ -97,8 +97,10 @@ class _Book:
             after = self.add_state(trial.after, self.scenes[state])
         for (row, col), target, (agnostic, goal), goes_on in trial.rows:
             self.rows.append(
-                (state, choice.primitive, row, col, choice.rotation, target, agnostic, goal)
-                + (after if goes_on else -1, choice.greedy, int(trial.outcome))
+                (
+                    *(state, choice.primitive, row, col, choice.rotation, target, agnostic, goal),
+                    *(after if goes_on else -1, choice.greedy, int(trial.outcome)),
+                )
             )
 
     def shard(self) -> Shard:
@@ -219,7 +221,7 @@ def _choices(
             yield from _random_push(state, mask, config, rng)
 
 
-def _pick(primitive: int, q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> _Choice:
+def _best_grasp(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> _Choice:
     greedy = rng.random() < _GREEDY_SHARE
     best = list(best_cells(q, mask, 1 if greedy else _AMONG_BEST))
     k, row, col, _ = best[int(rng.integers(len(best)))]

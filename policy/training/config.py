@@ -43,7 +43,7 @@ class CollectSettings(_Table):
 
     # Attempts of each primitive in every state, each from the same saved state.
     grasps: Annotated[int, Field(ge=0)] = 12
-    pushes: Annotated[int, Field(ge=0)] = 3
+    pushes: Annotated[int, Field(ge=0)] = 4
     # States of a scene at most.
     states: Count = 6
 
@@ -105,23 +105,23 @@ class TrainConfig(_Table):
     # Scenes of training; evaluations use seeds below.
     first_seed: Annotated[int, Field(ge=1_000_000, le=100_000_000)] = 1_000_000
     # Scenes that one worker plays at a time; a shard holds their states.
-    scenes_per_task: Count = 4
+    scenes_per_task: Count = 2
     # Stage 2 alone, without the weights and the shards of a stage 1 (an ablation).
     single_stage: bool = False
     collect: CollectSettings = CollectSettings()
     learning: LearningSettings = LearningSettings()
     stage1: StageSettings = StageSettings(
-        rounds=24,
-        scenes_per_round=48,
-        updates_per_round=300,
+        rounds=12,
+        scenes_per_round=24,
+        updates_per_round=200,
         warmup_rounds=2,
-        exploration_start=0.5,
-        exploration_end=0.1,
+        exploration_start=0.6,
+        exploration_end=0.15,
     )
     stage2: StageSettings = StageSettings(
-        rounds=24,
-        scenes_per_round=48,
-        updates_per_round=300,
+        rounds=10,
+        scenes_per_round=24,
+        updates_per_round=200,
         warmup_rounds=0,
         exploration_start=0.3,
         exploration_end=0.1,

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from policy.encoding import CHANNELS, encode
 from policy.push_line import PushLine, free_to_descend, push_line
+from policy.selection import surface_at
 from policy.training.scenes import training_scene
 from policy.training.shard import GRASP, PUSH
 from robotcell.config import CameraMount, CellConfig
@@ -363,14 +364,6 @@ def border_occupancy(mask: npt.NDArray[np.bool_], height_m: npt.NDArray[np.float
     return float(occupied.mean()) if len(heights) else 0.0
 
 
-def surface_at(height_m: npt.NDArray[np.float32], cell: Cell) -> float:
-    """Height [m] of the surface at a cell: the median of 5 x 5, unknown cells left out."""
-    row, col = cell
-    around = height_m[max(0, row - 2) : row + 3, max(0, col - 2) : col + 3]
-    known = around[np.isfinite(around)]
-    return float(np.median(known)) if known.size else 0.0
-
-
 def _moved(
     before: list[tuple[tuple[float, ...], tuple[float, ...]]], after: list[tuple[tuple[float, ...], tuple[float, ...]]]
 ) -> npt.NDArray[np.intp]:
@@ -378,4 +371,4 @@ def _moved(
     return np.flatnonzero(np.linalg.norm(a - b, axis=1) > _MOVED_M)
 
 
-__all__ = ["GRASP", "PUSH", "Outcome", "PushGraspEnv", "State", "Trial", "border_occupancy", "surface_at"]
+__all__ = ["GRASP", "PUSH", "Outcome", "PushGraspEnv", "State", "Trial", "border_occupancy"]

@@ -1,0 +1,126 @@
+"""The learned policy: the network's Q maps, the masks that select from them, and the rule that says when to push."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from policy.push_line import free_to_descend
+from policy.repeats import repeats
+from policy.selection import best_cells, check_maps, push_mask, pushes, surface_at
+from policy.surface import cell_centers
+from robotcell.decision import Action, Primitive
+from robotcell.errors import NoTarget
+from robotcell.heightmap import close_gaps
+
+if TYPE_CHECKING:
+    from policy.inference import Inference
+    from robotcell.config import CellConfig
+    from robotcell.decision import Observation
+
+# A push is taken when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside the
+# goal's mask is below a threshold), and ...
+GRASP_THRESHOLD = 0.6
+# ... there is a push that promises more than this over what the grasp does.
+_PUSH_GAIN = 0.0
+
+
+class LearnedPolicy:
+    """Takes the grasp of the largest Q, or a push first where no grasp is likely to succeed.
+
+    Args:
+        config: of the cell: table, workspace and length of a push.
+        inference: the network.
+        name: as the journal calls the policy.
+        may_push: False never pushes.
+    """
+
+    def __init__(
+        self, config: CellConfig, inference: Inference, name: str = "learned", *, may_push: bool = True
+    ) -> None:
+        self.name = name
+        self._inference = inference
+        self._may_push = may_push
+        self._table_height_m = config.table.height_m
+        self._push_m = config.motion.push_m
+
+    def decide(self, observation: Observation) -> Action:
+        """The best action.
+
+        Raises:
+            NoTarget: no object is seen, or nothing is left that did not fail.
+            BadMapsError: the network's output is not finite, flat or empty.
+        """
+        targets = observation.objects if observation.goal is None else observation.goal
+        if not targets.any():
+            what = "no object" if observation.goal is None else "no cell of the goal"
+            raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
+        heightmap = observation.heightmap
+        height_m = close_gaps(heightmap.height_m)
+        grasp_q, push_q = self._inference.maps(heightmap.height_m, heightmap.color)
+        check_maps(grasp_q, "grasp")
+        check_maps(push_q, "push")
+        may_push = observation.may_push and self._may_push
+        grasp = self._grasp(observation, grasp_q, targets, height_m)
+        if may_push and (grasp is None or grasp.q_value < GRASP_THRESHOLD):
+            push = self._push(observation, push_q, targets, height_m)
+            if push is not None and (grasp is None or push.q_value > grasp.q_value + _PUSH_GAIN):
+                return push
+        if grasp is not None:
+            return grasp
+        raise NoTarget(
+            f"every grasp{' and every push' if may_push else ''} has failed; "
+            "rearrange the objects by hand, or choose another goal"
+        )
+
+    def _grasp(
+        self,
+        observation: Observation,
+        q: npt.NDArray[np.float32],
+        targets: npt.NDArray[np.bool_],
+        height_m: npt.NDArray[np.float32],
+    ) -> Action | None:
+        mask = _allowed(Primitive.GRASP, observation, targets, len(q))
+        for k, row, col, value in best_cells(q, mask, 1):
+            z = self._table_height_m + surface_at(height_m, (row, col))
+            return Action(Primitive.GRASP, row, col, k, (*self._position(observation, row, col), z), value)
+        return None
+
+    def _push(
+        self,
+        observation: Observation,
+        q: npt.NDArray[np.float32],
+        targets: npt.NDArray[np.bool_],
+        height_m: npt.NDArray[np.float32],
+    ) -> Action | None:
+        workspace = observation.heightmap.workspace
+        free = free_to_descend(height_m, workspace)
+        mask = push_mask(targets, observation.objects)
+        for k, value, line in pushes(q, mask, height_m, free, self._push_m, workspace.resolution_m):
+            x, y = self._position(observation, line.row, line.col)
+            at = np.array([x]), np.array([y])
+            if repeats(Primitive.PUSH, *at, np.array([k]), observation.barred).any():
+                continue
+            return Action(Primitive.PUSH, line.row, line.col, k, (x, y, self._table_height_m + line.top_m), value)
+        return None
+
+    @staticmethod
+    def _position(observation: Observation, row: int, col: int) -> tuple[float, float]:
+        return observation.heightmap.workspace.position(row, col)
+
+
+def _allowed(
+    primitive: Primitive, observation: Observation, mask: npt.NDArray[np.bool_], rotations: int
+) -> npt.NDArray[np.bool_]:
+    """(K, H, W) the cells of a mask (H, W) in every rotation, less those that would repeat a failure."""
+    allowed = np.broadcast_to(mask, (rotations, *mask.shape))
+    if not observation.barred:
+        return allowed
+    rows, cols = np.nonzero(mask)
+    x, y = cell_centers(observation.heightmap.workspace, rows, cols)
+    failed = repeats(primitive, x[None], y[None], np.arange(rotations)[:, None], observation.barred)
+    allowed = allowed.copy()
+    allowed[:, rows, cols] &= ~failed
+    return np.asarray(allowed, np.bool_)
