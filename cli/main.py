@@ -76,6 +76,47 @@ def pick(
     raise typer.Exit(run_pick(goal, all_, cell, given, dry_run=dry_run, as_json=json_))
 
 
+@app.command()
+def train(
+    stage: Annotated[int, typer.Option(min=1, max=2, help="1: pick anything; 2: pick a goal, after stage 1.")],
+    run: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("runs/train"),
+    config: Annotated[
+        Path | None, typer.Option(help="A training TOML file; without one, the defaults.", show_default=False)
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a stage that was stopped.")] = False,
+    from_scratch: Annotated[
+        bool, typer.Option("--from-scratch", help="Stage 2 without a stage 1, as long as both together.")
+    ] = False,
+    rounds: Annotated[
+        int | None, typer.Option(min=1, help="Rounds of the stage, above the configuration.", show_default=False)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes that play scenes; one per processor.", show_default=False)
+    ] = None,
+    ray: Annotated[
+        str | None, typer.Option(help="Address of a Ray cluster that plays the scenes.", show_default=False)
+    ] = None,
+) -> None:
+    """Train the policy in the twin.
+
+    Exit codes: 0 trained, 2 usage or configuration, 3 a worker died, 130 interrupted (go on with --resume).
+    """
+    from cli.train import run_train
+
+    raise typer.Exit(
+        run_train(
+            stage,
+            run,
+            config,
+            resume=resume,
+            from_scratch=from_scratch,
+            rounds=rounds,
+            workers=workers,
+            ray_address=ray,
+        )
+    )
+
+
 @jobs_app.callback()
 def jobs(
     context: typer.Context,

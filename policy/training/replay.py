@@ -126,7 +126,7 @@ class Replay:
     @property
     def priorities(self) -> npt.NDArray[np.float64]:
         """(len,) of every state that can be drawn; set to go on from a checkpoint."""
-        return self._priorities.copy()
+        return np.array(self._priorities)
 
     @priorities.setter
     def priorities(self, values: npt.NDArray[np.float64]) -> None:

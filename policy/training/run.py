@@ -25,7 +25,7 @@ from policy.networks import make_network
 from policy.parallel import run_tasks
 from policy.training import collect as playing
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
-from policy.training.config import load_train_config, save_train_config
+from policy.training.config import load_train_config, save_train_config, single_stage, with_rounds
 from policy.training.curves import draw_curves
 from policy.training.learner import Learner
 from policy.training.replay import Replay
@@ -61,7 +61,7 @@ def train(
     """Train one stage to its end, from wherever its folder says that it is.
 
     Args:
-        config: as `prepare` returned it.
+        config: of the run, as `prepare` returned it.
         stage: 1 or 2.
         run: folder of the run.
         workers: that play scenes; see `policy.parallel.run_tasks`.
@@ -128,14 +128,24 @@ def train(
     return folder / "weights.safetensors"
 
 
-def prepare(config: TrainConfig | None, stage: int, run: Path, *, resume: bool) -> TrainConfig:
+def prepare(
+    stage: int,
+    run: Path,
+    config: TrainConfig | None = None,
+    *,
+    resume: bool = False,
+    from_scratch: bool = False,
+    rounds: int | None = None,
+) -> TrainConfig:
     """Check that a stage can start or go on, and write its train.toml.
 
     Args:
-        config: None for that of the stage when it is resumed, that of stage 1 when stage 2 starts, or the defaults.
         stage: 1 or 2.
         run: folder of the run.
-        resume: whether the stage is to have been started already.
+        config: None for that of stage 1 when stage 2 starts, or else the defaults. A stage that is resumed has its own.
+        resume: whether the stage has been started already.
+        from_scratch: stage 2 alone, see `single_stage`.
+        rounds: of the stage, instead of what the configuration says.
 
     Returns:
         The configuration that counts.
@@ -146,17 +156,21 @@ def prepare(config: TrainConfig | None, stage: int, run: Path, *, resume: bool) 
     folder = run / f"stage{stage}"
     written = folder / "train.toml"
     if resume:
+        if config is not None or from_scratch:
+            raise ConfigError("a stage is resumed with the configuration that it was started with; leave out the other")
         if not written.exists():
             raise ConfigError(f"{folder}: there is nothing to resume; start it without --resume")
-        config = config or load_train_config(written)
+        config = load_train_config(written)
     else:
         if written.exists():
             raise ConfigError(f"{folder}: this stage was started before; go on with --resume, or choose another --run")
-        if config is None:
-            first = run / "stage1" / "train.toml"
-            config = load_train_config(first if stage == 2 and first.exists() else None)
+        first = run / "stage1" / "train.toml"
+        config = config or load_train_config(first if stage == 2 and first.exists() else None)
+        config = single_stage(config) if from_scratch else config
+    if rounds is not None:
+        config = with_rounds(config, stage, rounds)
     if stage == 1 and config.single_stage:
-        raise ConfigError("single_stage = true: this configuration has no stage 1; use --stage 2")
+        raise ConfigError("there is no stage 1 in a single-stage training; use --stage 2")
     if stage == 2 and not config.single_stage:
         _check_stage1(run)
     try:
