@@ -54,6 +54,9 @@ def _train(
     ray_address: str | None,
     err: Console,
 ) -> Path:
+    # Read when PyTorch is loaded. Where other programs use the processor, threads that wait by spinning take it from
+    # those that work: an update takes 2.4 s instead of 0.7 s on two busy cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         from policy.training.config import load_train_config
         from policy.training.run import prepare, train
