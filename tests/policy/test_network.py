@@ -1,0 +1,47 @@
+import pytest
+import torch
+
+from policy.network import QNetwork
+from policy.networks import NETWORKS, make_network
+from policy.paper_network import PaperNetwork
+from robotcell.errors import ConfigError
+
+
+@pytest.fixture(scope="module")
+def network():
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return QNetwork()
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (48, 32)])
+def test_its_maps_are_as_fine_as_the_heightmap(network, shape):
+    grasp, push = network(torch.zeros(2, 5, *shape))
+    assert grasp.shape == (2, 8, *shape)
+    assert push.shape == (2, 16, *shape)
+
+
+def test_gradients_reach_every_parameter(network):
+    x = torch.randn(2, 5, 32, 32, generator=torch.Generator().manual_seed(0))
+    network.zero_grad()
+    grasp, push = network.train()(x)
+    (grasp.square().mean() + push.square().mean()).backward()
+    assert [name for name, p in network.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+def test_a_map_sees_what_is_beside_its_cell(network):
+    x = torch.randn(1, 5, 64, 64, generator=torch.Generator().manual_seed(0))
+    other = x.clone()
+    other[:, 0, 40:44, 32] += 1
+    with torch.no_grad():
+        for one, two in zip(network.eval()(x), network.eval()(other), strict=True):
+            assert (one[:, :, 32, 32] != two[:, :, 32, 32]).all()
+
+
+def test_networks_go_by_name():
+    assert {name: type(make_network(name)) for name in NETWORKS} == {"fast": QNetwork, "paper": PaperNetwork}
+
+
+def test_an_unknown_network_lists_those_that_exist():
+    with pytest.raises(ConfigError, match="no network is called 'deep'; there is: fast, paper"):
+        make_network("deep")
