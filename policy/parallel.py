@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 from robotcell.errors import CellError, ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Generator, Iterable
     from multiprocessing.connection import Connection
     from multiprocessing.context import SpawnProcess
     from types import FrameType
@@ -45,12 +45,12 @@ def run_tasks(
     tasks: Iterable[_Task],
     workers: int | None = None,
     ray_address: str | None = None,
-) -> Iterator[tuple[int, _Result]]:
+) -> Generator[tuple[int, _Result], None, None]:
     """Call a function on every task, and yield (number of the task from 0, result) as each call ends.
 
     A task is taken from `tasks` when a worker is free for it, so that an endless iterable may still react to
-    results. One that gives up early closes the iterator (`contextlib.closing`): no worker outlives it, and what a
-    worker had in hand is cut off.
+    results. A caller that gives up early closes the generator (`contextlib.closing`): no worker outlives it, and
+    what a worker had in hand is cut off.
 
     Args:
         function: of the top level of a module, as it is sent to the workers by name.
@@ -108,7 +108,9 @@ def _packed(function: Callable[[Any], Any], task: object) -> bytes:
     return packed
 
 
-def _in_processes(function: Callable[[Any], Any], tasks: Iterable[Any], workers: int) -> Iterator[tuple[int, Any]]:
+def _in_processes(
+    function: Callable[[Any], Any], tasks: Iterable[Any], workers: int
+) -> Generator[tuple[int, Any], None, None]:
     context = multiprocessing.get_context("spawn")
     remaining = enumerate(tasks)
     processes: list[SpawnProcess] = []
@@ -199,7 +201,7 @@ def _leave(number: int, _frame: FrameType | None) -> None:
 
 def _on_ray(
     function: Callable[[Any], Any], tasks: Iterable[Any], workers: int | None, address: str
-) -> Iterator[tuple[int, Any]]:
+) -> Generator[tuple[int, Any], None, None]:
     # Ray reports its use to its makers unless told not to.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
