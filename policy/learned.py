@@ -51,7 +51,7 @@ class LearnedPolicy:
 
         Raises:
             NoTarget: no object is seen, or nothing is left that did not fail.
-            BadMapsError: the network's output is not finite, flat or empty.
+            ConfigError: the network's maps are not finite, flat or empty.
         """
         targets = observation.objects if observation.goal is None else observation.goal
         if not targets.any():

@@ -80,17 +80,16 @@ def push_line(
     length = round(push_m / resolution_m)
     back = np.arange(length - round(_FOLLOW_M / resolution_m) + 1)
     rows, cols = np.rint(np.array(cell)[:, None] - direction[:, None] * back).astype(np.intp)
-    inside = (rows >= 0) & (rows < free.shape[0]) & (cols >= 0) & (cols < free.shape[1])
-    if not inside.all():
-        end = int(inside.argmin())
-        rows, cols = rows[:end], cols[:end]
+    outside = np.flatnonzero((rows < 0) | (rows >= free.shape[0]) | (cols < 0) | (cols >= free.shape[1]))
+    if len(outside):
+        rows, cols = rows[: outside[0]], cols[: outside[0]]
     starts = np.flatnonzero(free[rows, cols])
     if not len(starts):
         return None
     start = np.array([rows[starts[0]], cols[starts[0]]])
     way = np.rint(start[:, None] + direction[:, None] * np.arange(length + 1)).astype(np.intp)
-    inside = ((way >= 0) & (way < np.array(free.shape)[:, None])).all(axis=0)
-    cells = way[:, : int(inside.argmin()) if not inside.all() else len(inside)].T
+    outside = np.flatnonzero(((way < 0) | (way >= np.array(free.shape)[:, None])).any(axis=0))
+    cells = way.T[: outside[0]] if len(outside) else way.T
     profile = np.nan_to_num(height_m[cells[:, 0], cells[:, 1]], nan=0.0)
     met = np.flatnonzero(profile > _OBJECT_M)
     if not len(met):

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.push_line import PushLine, push_line
+from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,22 +26,21 @@ _PUSH_TRIES = 2000
 _FLAT = 1e-6
 
 
-class BadMapsError(ValueError):
-    """The network's output cannot be acted upon."""
-
-
 def check_maps(q: npt.NDArray[np.float32], name: str) -> None:
-    """Refuse Q maps (K, H, W) that are empty, not finite, or the same everywhere.
+    """Refuse Q maps (K, H, W) that no action can be read from.
 
     Raises:
-        BadMapsError: they are.
+        ConfigError: they are empty, not finite, or the same everywhere.
     """
-    if q.ndim != 3 or not q.size:
-        raise BadMapsError(f"the {name} maps are empty: shape {q.shape}")
-    if not np.isfinite(q).all():
-        raise BadMapsError(f"the {name} maps hold {np.count_nonzero(~np.isfinite(q))} values that are not finite")
-    if np.ptp(q) < _FLAT:
-        raise BadMapsError(f"the {name} maps are flat: every value is {float(q.flat[0]):.4g}")
+    if not q.size:
+        problem = f"are empty, of shape {q.shape}"
+    elif not np.isfinite(q).all():
+        problem = f"hold {np.count_nonzero(~np.isfinite(q))} values that are not finite"
+    elif np.ptp(q) < _FLAT:
+        problem = f"are flat, every value is {float(q.flat[0]):.4g}"
+    else:
+        return
+    raise ConfigError(f"the network's {name} maps {problem}: its weights are broken; choose others, or train again")
 
 
 def push_mask(targets: npt.NDArray[np.bool_], objects: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:

@@ -590,7 +590,6 @@ class World:
         built.visuals = tuple(visual for visual, _ in entries)
         built.carriers = tuple(carrier for _, carrier in entries)
 
-
     def _robot_visuals(self) -> list[tuple[Visual, tuple[str, int]]]:
         """The arm and its gripper, each with the frame that carries it."""
         joints = self._need().joints

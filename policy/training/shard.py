@@ -72,11 +72,12 @@ class Shard:
 def pack_height(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
     """Heights [m] with NaN for unknown, as whole tenths of a millimetre; 0 for unknown."""
     units = np.rint((height_m - np.float32(_LOWEST_M)) / np.float32(_UNIT_M)) + 1
-    return np.nan_to_num(units, nan=0.0).clip(0, 65535).astype(np.uint16)
+    packed: npt.NDArray[np.uint16] = np.nan_to_num(units, nan=0.0).clip(0, 65535).astype(np.uint16)
+    return packed
 
 
 def unpack_height(units: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
     """The inverse of `pack_height`."""
-    height = (units.astype(np.float32) - 1) * np.float32(_UNIT_M) + np.float32(_LOWEST_M)
+    height: npt.NDArray[np.float32] = (units.astype(np.float32) - 1) * np.float32(_UNIT_M) + np.float32(_LOWEST_M)
     height[units == 0] = np.nan
     return height
