@@ -1,0 +1,132 @@
+"""The task as an environment."""
+
+import warnings
+
+import gymnasium.utils.env_checker
+import numpy as np
+import pytest
+
+from policy.training.environment import (
+    GRASP,
+    PUSH,
+    PUSH_REWARD,
+    Outcome,
+    PushGraspEnv,
+    border_occupancy,
+)
+from robotcell.config import load_config
+
+SEED = 1_500_000
+
+
+@pytest.fixture
+def env(request):
+    env = PushGraspEnv(load_config(), stage=2)
+    request.addfinalizer(env.close)
+    env.reset(seed=SEED, options={"kind": "packed", "count": 4})
+    return env
+
+
+def middle(env, label):
+    rows, cols = np.nonzero(env.state.labels == label)
+    i = int(np.argmin((rows - rows.mean()) ** 2 + (cols - cols.mean()) ** 2))
+    return int(rows[i]), int(cols[i])
+
+
+def test_it_is_an_environment_as_gymnasium_defines_one(request):
+    env = PushGraspEnv(load_config(), stage=1)
+    request.addfinalizer(env.close)
+    with warnings.catch_warnings():
+        # It asks for bounds of the observations, which heights and colours of no fixed scale do not have.
+        warnings.filterwarnings("ignore", message=".*(infinity|-infinity).*")
+        gymnasium.utils.env_checker.check_env(env, skip_render_check=True)
+
+
+def test_the_same_seed_gives_the_same_scene(request):
+    first, second = (PushGraspEnv(load_config(), stage=2) for _ in range(2))
+    request.addfinalizer(first.close)
+    request.addfinalizer(second.close)
+    options = {"kind": "drop", "count": 3}
+    (a, a_info), (b, b_info), (c, _) = (
+        env.reset(seed=seed, options=options) for env, seed in ((first, SEED), (second, SEED), (second, SEED + 1))
+    )
+    assert np.array_equal(a, b)
+    assert np.array_equal(a_info["labels"], b_info["labels"])
+    assert a_info["goal"] == b_info["goal"]
+    assert not np.array_equal(a, c)
+
+
+def test_every_object_is_seen_under_its_own_label(env):
+    assert set(env.state.occupied) == {1, 2, 3, 4}
+    assert env.goal in env.state.occupied
+    heights = env.state.height_m[env.state.labels > 0]
+    assert np.nanmin(heights) > 0.010
+
+
+def test_attempts_leave_the_scene_as_it_is(env):
+    before = env.state
+    outcomes = [
+        [env.attempt(GRASP, k, middle(env, label)).outcome for label in (1, 2) for k in (0, 4)] for _ in range(2)
+    ]
+    assert outcomes[0] == outcomes[1]
+    assert env.state is before
+    assert env.state.labels.any()
+
+
+def test_a_goal_that_is_grasped_is_rewarded_and_leaves_the_table(env):
+    for label in sorted(env.state.occupied):
+        for k in range(8):
+            cell = middle(env, label)
+            trial = env.attempt(GRASP, k, cell)
+            if trial.outcome is Outcome.PICKED:
+                ((place, target, rewards, goes_on),) = trial.rows
+                assert (place, target, rewards, goes_on) == (cell, label, (1.0, 1.0), False)
+                assert label in env.advance(GRASP, k, cell).held
+                assert label not in env.state.occupied
+                return
+    pytest.fail("no object of the scene could be grasped")
+
+
+def test_a_step_in_stage_2_ends_with_the_goal(env):
+    goal, cell = env.goal, middle(env, env.goal)
+    ended = []
+    for k in range(8):
+        _, reward, over, truncated, info = env.step(np.array([GRASP, k, *cell]))
+        assert reward in {0.0, 1.0}
+        assert over == (reward == 1.0)
+        assert not truncated
+        ended.append(over)
+        if over:
+            assert info["goal"] != goal
+            break
+        cell = middle(env, goal)
+    assert any(ended) or env.goal == goal
+
+
+def test_a_push_tells_of_every_object_on_its_way(env):
+    seen = []
+    for label in sorted(env.state.occupied):
+        for k in range(0, 16, 3):
+            trial = env.attempt(PUSH, k, middle(env, label))
+            seen.append(trial.outcome)
+            assert (trial.after is not None) == (trial.outcome is Outcome.PUSHED)
+            assert label in {target for _, target, _, _ in trial.rows} or trial.outcome is Outcome.PUSHED
+            for (row, col), target, rewards, goes_on in trial.rows:
+                assert env.state.labels[row, col] == target
+                assert set(rewards) <= {0.0, PUSH_REWARD}
+                assert not goes_on or trial.after is not None
+    assert Outcome.PUSHED in seen
+
+
+def test_the_border_of_an_object_is_occupied_by_what_stands_beside_it():
+    heights = np.zeros((100, 100), np.float32)
+    mask = np.zeros((100, 100), np.bool_)
+    mask[40:60, 40:60] = True
+    heights[mask] = 0.05
+    assert border_occupancy(mask, heights) == 0.0
+    heights[30:70, 60:70] = 0.05
+    # The border is 40 x 40 cells less 20 x 20, the neighbour takes 10 x 40 of it.
+    assert border_occupancy(mask, heights) == pytest.approx(400 / 1200)
+    heights[30:70, 60:70] = 0.015
+    assert border_occupancy(mask, heights) == 0.0
+    assert border_occupancy(np.zeros_like(mask), heights) == 0.0
