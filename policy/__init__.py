@@ -36,4 +36,31 @@ def _random(config: CellConfig) -> Policy:
     return RandomPolicy(config)
 
 
-_MAKERS: dict[str, Callable[[CellConfig], Policy]] = {"heuristic": _heuristic, "random": _random}
+def _learned(config: CellConfig) -> Policy:
+    return _of_weights("learned", "learned", config)
+
+
+def _grasp_only(config: CellConfig) -> Policy:
+    return _of_weights("grasp-only", "learned", config, may_push=False)
+
+
+def _single_stage(config: CellConfig) -> Policy:
+    return _of_weights("single-stage", "single-stage", config)
+
+
+def _of_weights(name: str, weights: str, config: CellConfig, *, may_push: bool = True) -> Policy:
+    """A policy of weights that come with the package."""
+    from policy.inference import Inference
+    from policy.learned import LearnedPolicy
+    from policy.weights import load_named
+
+    return LearnedPolicy(config, Inference(load_named(weights)[0]), name, may_push=may_push)
+
+
+_MAKERS: dict[str, Callable[[CellConfig], Policy]] = {
+    "learned": _learned,
+    "grasp-only": _grasp_only,
+    "single-stage": _single_stage,
+    "heuristic": _heuristic,
+    "random": _random,
+}

@@ -21,13 +21,15 @@ def cube(name, x, y):
 
 
 @pytest.fixture
-def rig(request):
+def rig():
     """Two cubes, 20 mm apart."""
     scene = Scene("two cubes", (cube("one", X, Y), cube("two", X + 0.07, Y)), drop=False)
     world = RigWorld(load_config(), TwinOptions(), scene, Friction())
-    request.addfinalizer(world.close)
-    world.connect()
-    return world
+    try:
+        world.connect()
+        yield world
+    finally:
+        world.close()
 
 
 def grasp(rig, x, y, theta):

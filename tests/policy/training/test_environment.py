@@ -20,11 +20,13 @@ SEED = 1_500_000
 
 
 @pytest.fixture
-def env(request):
+def env():
     env = PushGraspEnv(load_config(), stage=2)
-    request.addfinalizer(env.close)
-    env.reset(seed=SEED, options={"kind": "packed", "count": 4})
-    return env
+    try:
+        env.reset(seed=SEED, options={"kind": "packed", "count": 4})
+        yield env
+    finally:
+        env.close()
 
 
 def middle(env, label):
