@@ -1,0 +1,104 @@
+"""From a frame to an action with the learned policy, whole and in parts, and the paper's network beside it:
+`pytest tests/benchmarks/test_policy.py --benchmark-enable -s`.
+
+Targets on two cores at 640x480: frame to action 60 ms, and the paper's network at least 50 times slower.
+"""
+
+import statistics
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from policy import make_policy
+from policy.encoding import encode
+from policy.inference import Inference
+from policy.networks import make_network
+from policy.weights import load_named
+from robotcell.cell import open_cell
+from robotcell.config import load_config
+from robotcell.decision import Observation
+from robotcell.heightmap import build_heightmap
+from robotcell.perception import find_goal, segment
+
+OBJECTS = 30
+ROUNDS = 20
+
+
+@pytest.fixture(scope="module")
+def config():
+    return load_config(None, {"backend.options.seed": 5, "backend.options.objects": OBJECTS})
+
+
+@pytest.fixture(scope="module")
+def frame(config):
+    with open_cell(config) as cell:
+        return cell.camera.read()
+
+
+@pytest.fixture(scope="module")
+def heightmap(config, frame):
+    return build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+
+
+@pytest.fixture(scope="module")
+def policy(config):
+    return make_policy("learned", config)
+
+
+@pytest.fixture(scope="module")
+def inference():
+    return Inference(load_named("learned")[0])
+
+
+def observe(heightmap):
+    segmentation = segment(heightmap)
+    goal = find_goal(segmentation, segmentation.instances[0].color_name)
+    return Observation(heightmap, segmentation.labels, segmentation.mask(goal), (), may_push=True)
+
+
+def frame_to_action(config, frame, policy):
+    heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+    return policy.decide(observe(heightmap))
+
+
+def test_encode(benchmark, heightmap):
+    assert benchmark(encode, heightmap.height_m, heightmap.color).shape == (5, 224, 224)
+
+
+def test_maps(benchmark, heightmap, inference):
+    grasp, push = benchmark(inference.maps, heightmap.height_m, heightmap.color)
+    assert np.isfinite(grasp).all()
+    assert np.isfinite(push).all()
+
+
+def test_decide(benchmark, heightmap, policy):
+    observation = observe(heightmap)
+    assert np.isfinite(benchmark(policy.decide, observation).q_value)
+
+
+def test_frame_to_action(benchmark, config, frame, policy):
+    assert np.isfinite(benchmark(frame_to_action, config, frame, policy).q_value)
+
+
+def test_beside_the_paper_network(benchmark, config, frame, heightmap, policy):
+    """The paper's network once, ours many times, in the same process and run."""
+    paper = Inference(make_network("paper"))
+
+    def compare():
+        started = time.perf_counter()
+        paper.maps(heightmap.height_m, heightmap.color)
+        paper_s = time.perf_counter() - started
+        ours = []
+        for _ in range(ROUNDS):
+            started = time.perf_counter()
+            frame_to_action(config, frame, policy)
+            ours.append(time.perf_counter() - started)
+        return paper_s, statistics.median(ours)
+
+    paper_s, ours_s = benchmark.pedantic(compare, rounds=1)
+    print(
+        f"\n{torch.get_num_threads()} threads: paper's network {paper_s:.1f} s, frame to action {1000 * ours_s:.1f} ms, "
+        f"{paper_s / ours_s:.0f} times faster"
+    )
