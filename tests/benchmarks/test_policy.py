@@ -5,6 +5,7 @@ Targets on two cores at 640x480: frame to action 60 ms, and the paper's network 
 """
 
 import statistics
+import sys
 import time
 
 import numpy as np
@@ -98,7 +99,7 @@ def test_beside_the_paper_network(benchmark, config, frame, heightmap, policy):
         return paper_s, statistics.median(ours)
 
     paper_s, ours_s = benchmark.pedantic(compare, rounds=1)
-    print(
-        f"\n{torch.get_num_threads()} threads: paper's network {paper_s:.1f} s, frame to action {1000 * ours_s:.1f} ms, "
-        f"{paper_s / ours_s:.0f} times faster"
+    sys.stdout.write(
+        f"\n{torch.get_num_threads()} threads: paper's network {paper_s:.1f} s, "
+        f"frame to action {1000 * ours_s:.1f} ms, {paper_s / ours_s:.0f} times faster\n"
     )
