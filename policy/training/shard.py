@@ -65,7 +65,8 @@ class Shard:
     @staticmethod
     def load(path: Path) -> Shard:
         """Read what `save` wrote."""
-        with np.load(path, allow_pickle=False) as file:
+        # numpy leaves a damaged file open that it opened itself.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return Shard(**{field.name: file[field.name] for field in fields(Shard)})
 
 

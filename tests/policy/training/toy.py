@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from typing import TYPE_CHECKING
 
 import cv2
@@ -59,12 +58,6 @@ def collect(collection: Collection) -> Shard:
         greedy=np.full(len(rows), collection.weights is not None),
         outcome=np.zeros(len(rows), np.int8),
     )
-
-
-def collect_slowly(collection: Collection) -> Shard:
-    """Leaves time to be killed."""
-    time.sleep(0.3)
-    return collect(collection)
 
 
 def _bars(rng: np.random.Generator) -> list[tuple[float, float, int]]:
