@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' 2>/dev/null && echo $$p && break; done)
 
-.PHONY: demo test check bench bench-picks setup clean
+.PHONY: demo test check bench setup clean
 
 demo: setup
 	$(BIN)/robotcell pick --goal red
@@ -21,9 +21,6 @@ check: setup
 
 bench: setup
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
-
-bench-picks: setup
-	$(BIN)/python -m tests.benchmarks.picks
 
 setup: $(VENV)/.installed
 

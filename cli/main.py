@@ -117,6 +117,60 @@ def train(
     )
 
 
+@app.command()
+def bench(
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="One or several of random, challenging, agnostic, random-all, novel, as a,b.", show_default=False
+        ),
+    ] = None,
+    policy: Annotated[
+        str | None, typer.Option(help="Who is compared, as a,b; the cell's own unless given.", show_default=False)
+    ] = None,
+    trials: Annotated[
+        int | None, typer.Option(help="Per scene; as many as make 30 per suite unless given.", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the first trial; 0 unless given.", show_default=False)] = None,
+    scenes: Annotated[
+        Path | None, typer.Option(help="Folder of scene files to use instead.", show_default=False)
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="Folder of the OBJ files that they name.", show_default=False)
+    ] = None,
+    cell: CellFile = None,
+    json_: Annotated[
+        Path | None, typer.Option("--json", help="Write all metrics and trials to this file.", show_default=False)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="How many trials run at once; 1 unless given.", show_default=False)
+    ] = None,
+    ray: Annotated[
+        str | None, typer.Option(help="Run on the Ray cluster of this address, or 'local'.", show_default=False)
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(help="Continue the benchmark of this folder.", show_default=False)
+    ] = None,
+) -> None:
+    """Compare policies on suites of scenes in the twin, with the paper's metrics and a page of results.
+
+    Exit codes: 0 every trial was run, whatever came of it, 2 usage or configuration, 3 a worker died.
+    """
+    from cli.bench import run_bench
+
+    options = {
+        "suite": suite,
+        "policy": policy,
+        "trials": trials,
+        "seed": seed,
+        "scenes": scenes,
+        "meshes": meshes,
+        "cell": cell,
+    }
+    given = {key: value for key, value in options.items() if value is not None}
+    raise typer.Exit(run_bench(given, resume, json_, workers, ray))
+
+
 @jobs_app.callback()
 def jobs(
     context: typer.Context,

@@ -42,7 +42,7 @@ class Metrics:
             its goal, and another object is no success.
         grasp_success_overall: successful grasps / grasps of all runs together.
         motions: pushes + grasps, mean over completed runs.
-        efficiency: objects / (pushes + grasps) of each completed run, their mean.
+        efficiency: objects / (pushes + grasps) of each completed run for everything, their mean.
         failures: how often each result that is no success occurred.
         decision_s, simulated_s, wall_s: medians over runs.
     """
@@ -76,8 +76,8 @@ PUBLISHED: dict[str, tuple[Published, ...]] = {
         Published("GI", 96.7, 54.6, motions=5.37),
         Published("EPG", 97.8, 90.0, motions=4.82),
         Published("paper", 100.0, 94.4, motions=2.44),
-        Published("paper, grasping only", 98.1, 61.8, motions=2.69),
-        Published("paper, without two-stage training", 100.0, 84.7, motions=3.40),
+        Published("grasping only", 98.1, 61.8, motions=2.69),
+        Published("without two-stage training", 100.0, 84.7, motions=3.40),
     ),
     "challenging": (
         Published("GI", 95.0, 70.4, motions=4.33),
@@ -96,7 +96,7 @@ def measure(results: Sequence[TrialResult]) -> Metrics:
     """The figures of one policy on one suite, of at least one trial."""
     completed = [result for result in results if result.completed]
     grasping = [result for result in completed if result.grasp_attempts]
-    acting = [result for result in completed if result.actions]
+    clearing = [result for result in completed if result.goal is None and result.actions]
     failures: Counter[str] = Counter()
     for result in results:
         failures.update(result.failures)
@@ -110,7 +110,7 @@ def measure(results: Sequence[TrialResult]) -> Metrics:
             [result.grasp_successes for result in results], [result.grasp_attempts for result in results]
         ),
         motions=mean([result.actions for result in completed]),
-        efficiency=mean([result.objects / result.actions for result in acting]),
+        efficiency=mean([result.objects / result.actions for result in clearing]),
         failures=dict(failures.most_common()),
         decision_s=median(decisions) if decisions else None,
         simulated_s=median(result.simulated_s for result in results),

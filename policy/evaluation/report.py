@@ -103,7 +103,7 @@ def _published_row(entry: Published) -> Row:
     if entry.efficiency is not None:
         last = _percent(entry.efficiency)
     cells = (_percent(entry.completion), _percent(entry.grasp_success), last, _NONE, _NONE, _NONE)
-    return Row(entry.method, cells, published=True)
+    return Row(f"{entry.method}, published", cells, published=True)
 
 
 def _percent(value: float) -> Cell:

@@ -272,13 +272,13 @@ class _Watcher:
     def ended(self, decision: Decision, outcome: Outcome) -> None:
         """Draw an action that failed."""
         if not outcome.success and len(self.failures) < _PICTURES:
-            page = draw_decision(decision, self.config, "", _BAD)
+            page = draw_decision(decision, self.config, f"{describe(decision)}: {outcome.result.value}", _BAD)
             self._show(describe(decision), outcome.result.value, outcome.detail, page)
 
     def show_end(self, reason: str) -> None:
         """Draw the table as a job left it that ended without a failed action."""
         if self.view is not None:
-            page = draw_view(self.view, None, None, self.config, "", _BAD)
+            page = draw_view(self.view, None, None, self.config, "not complete", _BAD)
             self._show("the table at the end", "not complete", reason, page)
 
     def _show(self, action: str, result: str, detail: str, page: npt.NDArray[np.uint8]) -> None:
