@@ -229,7 +229,7 @@ def _collect(
     done, attempts = len(paths) - len(missing), 0
     on_progress("collect", done, len(paths))
     if missing:
-        with closing(run_tasks(collect, missing.values(), workers, ray_address)) as results:  # type: ignore[type-var]
+        with closing(run_tasks(collect, missing.values(), workers, ray_address)) as results:
             for index, shard in results:
                 shard.save(places[index])
                 done += 1
