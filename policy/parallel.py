@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import pickle
@@ -217,6 +218,7 @@ def _on_ray(
             include_dashboard=False if local else None,
             runtime_env={"env_vars": _ONE_THREAD},
             log_to_driver=False,
+            logging_level=logging.WARNING,
         )
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ConfigError(f"no Ray cluster answers at {address!r} ({error}): check the address") from error
