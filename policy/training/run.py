@@ -9,6 +9,7 @@ of the round or update. So a run that was killed goes on where it was, and any n
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -74,57 +75,16 @@ def train(
         The trained weights.
 
     Raises:
-        ConfigError: stage 1 is not finished, or a file of the run is damaged.
+        ConfigError: stage 1 is not finished, a file of the run is damaged, or another process trains the stage.
     """
     folder = run / f"stage{stage}"
-    plan = config.stage(stage)
-    torch.manual_seed(config.seed)
-    learner = Learner(make_network(config.architecture), config.learning, stage, plan.updates, config.seed)
-    earlier = [] if stage == 1 or config.single_stage else _finished_stage1(run, learner)
-    first = 0
-    checkpoint = None
-    if (folder / "checkpoint.pt").exists():
-        checkpoint = load_checkpoint(folder / "checkpoint.pt")
-        learner.load_state(checkpoint)
-        first = checkpoint["rounds"]
-    history = [line for line in read_metrics(run) if (line["stage"], line["round"]) < (stage, first)]
-    _write_metrics(run, history)
-    replay = Replay(stage, config.learning.capacity_states, config.learning.priority_alpha)
-    played = [path for path in _shard_paths(folder) if _round_of(path) < first]
-    replay.extend(_newest([*earlier, *played], config.learning.capacity_states))
-    if checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
-        # Somebody may have deleted a shard; then all states are as new.
-        replay.priorities = checkpoint["priorities"].numpy()
-    _write_weights(run, folder, config, stage, learner, history)
-    for round_ in range(first, plan.rounds):
-        start = time.perf_counter()
-        shards, collected = _collect(config, stage, round_, folder, collect, workers, ray_address, on_progress)
-        replay.extend(shards)
-        if not len(replay):
-            raise ConfigError(
-                f"{folder / 'shards'}: the scenes of round {round_} gave nothing to learn from; set a larger "
-                "scenes_per_round, collect.grasps or collect.pushes, and train into another --run folder"
-            )
-        learned = _learn(learner, replay, plan.updates_per_round * (round_ + 1), on_progress)
-        metrics: Metrics = {
-            "stage": stage,
-            "round": round_,
-            "rounds": plan.rounds,
-            "exploration": config.exploration(stage, round_),
-            **collected,
-            **learned,
-            **learner.validate(replay.validation(_VALIDATION_STATES)),
-            "hours": (history[-1]["hours"] if history else 0.0) + (time.perf_counter() - start) / 3600,
-        }
-        history.append(metrics)
-        # The metrics first: a round without a checkpoint is done again, and its line is written anew.
-        _write_metrics(run, history)
-        state = {"rounds": round_ + 1, "stage": stage, "config": config.model_dump_json()}
-        state["priorities"] = torch.from_numpy(replay.priorities)
-        save_checkpoint(folder / "checkpoint.pt", {**learner.state(), **state})
-        _write_weights(run, folder, config, stage, learner, history)
-        draw_curves(history, run / "curves.png")
-        on_round(metrics)
+    with (folder / "lock").open("w") as lock:
+        try:
+            # Gone with the process, however it ends.
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{folder}: another process trains this stage; wait for it, or end it first") from None
+        _train(config, stage, run, folder, workers, ray_address, collect, on_progress, on_round)
     return folder / "weights.safetensors"
 
 
@@ -195,6 +155,67 @@ def read_metrics(run: Path) -> list[Metrics]:
         except ValueError:
             continue
     return lines
+
+
+def _train(
+    config: TrainConfig,
+    stage: int,
+    run: Path,
+    folder: Path,
+    workers: int | None,
+    ray_address: str | None,
+    collect: Callable[[playing.Collection], Shard],
+    on_progress: Progress,
+    on_round: Callable[[Metrics], None],
+) -> None:
+    plan = config.stage(stage)
+    torch.manual_seed(config.seed)
+    learner = Learner(make_network(config.architecture), config.learning, stage, plan.updates, config.seed)
+    earlier = [] if stage == 1 or config.single_stage else _finished_stage1(run, learner)
+    first = 0
+    checkpoint = None
+    if (folder / "checkpoint.pt").exists():
+        checkpoint = load_checkpoint(folder / "checkpoint.pt")
+        learner.load_state(checkpoint)
+        first = checkpoint["rounds"]
+    history = [line for line in read_metrics(run) if (line["stage"], line["round"]) < (stage, first)]
+    _write_metrics(run, history)
+    replay = Replay(stage, config.learning.capacity_states, config.learning.priority_alpha)
+    played = [path for path in _shard_paths(folder) if _round_of(path) < first]
+    replay.extend(_newest([*earlier, *played], config.learning.capacity_states))
+    if checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
+        # Somebody may have deleted a shard; then all states are as new.
+        replay.priorities = checkpoint["priorities"].numpy()
+    _write_weights(run, folder, config, stage, learner, history)
+    for round_ in range(first, plan.rounds):
+        start = time.perf_counter()
+        shards, collected = _collect(config, stage, round_, folder, collect, workers, ray_address, on_progress)
+        replay.extend(shards)
+        if not len(replay):
+            raise ConfigError(
+                f"{folder / 'shards'}: the scenes of round {round_} gave nothing to learn from; set a larger "
+                "scenes_per_round, collect.grasps or collect.pushes, and train into another --run folder"
+            )
+        learned = _learn(learner, replay, plan.updates_per_round * (round_ + 1), on_progress)
+        metrics: Metrics = {
+            "stage": stage,
+            "round": round_,
+            "rounds": plan.rounds,
+            "exploration": config.exploration(stage, round_),
+            **collected,
+            **learned,
+            **learner.validate(replay.validation(_VALIDATION_STATES)),
+            "hours": (history[-1]["hours"] if history else 0.0) + (time.perf_counter() - start) / 3600,
+        }
+        history.append(metrics)
+        # The metrics first: a round without a checkpoint is done again, and its line is written anew.
+        _write_metrics(run, history)
+        state = {"rounds": round_ + 1, "stage": stage, "config": config.model_dump_json()}
+        state["priorities"] = torch.from_numpy(replay.priorities)
+        save_checkpoint(folder / "checkpoint.pt", {**learner.state(), **state})
+        _write_weights(run, folder, config, stage, learner, history)
+        draw_curves(history, run / "curves.png")
+        on_round(metrics)
 
 
 def _collect(

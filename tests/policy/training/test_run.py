@@ -104,7 +104,13 @@ def assert_same(run: Path, other: Path) -> None:
 def test_a_run_leaves_everything_in_its_folder(trained: Path) -> None:
     assert {path.name for path in trained.iterdir()} == {"stage1", "metrics.jsonl", "curves.png", "weights.safetensors"}
     stage = trained / "stage1"
-    assert {path.name for path in stage.iterdir()} == {"train.toml", "checkpoint.pt", "weights.safetensors", "shards"}
+    assert {path.name for path in stage.iterdir()} == {
+        "train.toml",
+        "checkpoint.pt",
+        "weights.safetensors",
+        "shards",
+        "lock",
+    }
     shards = sorted((stage / "shards").iterdir())
     assert [path.name for path in shards] == [f"r{r:04d}-t{t:03d}.npz" for r in range(3) for t in range(3)]
     seeds = [tuple(dict.fromkeys(Shard.load(path).scene.tolist())) for path in shards]
@@ -235,6 +241,19 @@ def test_what_cannot_start_says_why(another: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be made"):
         prepare(1, tmp_path / "file")
+
+
+def test_two_processes_do_not_train_one_stage(another: Path) -> None:
+    def collect(_collection: object) -> Shard:
+        with pytest.raises(ConfigError, match="another process trains this stage"):
+            train(config, 1, another, workers=1, collect=toy.collect)
+        raise KeyboardInterrupt
+
+    config = prepare(1, another, resume=True, rounds=4)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, 1, another, workers=1, collect=collect)
+    # The interrupted one has let go.
+    train(config, 1, another, workers=1, collect=toy.collect)
 
 
 def test_a_damaged_shard_is_named(another: Path) -> None:
