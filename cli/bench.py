@@ -15,7 +15,7 @@ from cli.console import progress, report_error, results
 from policy.evaluation.benchmark import Settings, by_suite, finished, load, plan, run, start, write_json
 from policy.evaluation.page import write_page
 from policy.evaluation.report import results_table
-from policy.evaluation.suites import SUITES
+from policy.evaluation.suites import SUITES, describe_suite
 from robotcell.config import load_config
 from robotcell.errors import CellError, ConfigError
 
@@ -62,7 +62,7 @@ def run_bench(
         return report_error(error)
     out = results()
     for suite, figures in by_suite(done).items():
-        out.print(_table(suite, figures))
+        out.print(_table(suite, settings, figures))
     out.print(Text(f"page: {page}"), soft_wrap=True)
     return 0
 
@@ -150,9 +150,10 @@ def _standing(done: Sequence[TrialResult]) -> str:
     return "complete: " + (", ".join(f"{name} {sum(each)}/{len(each)}" for name, each in runs.items()) or "-")
 
 
-def _table(suite: str, figures: Mapping[str, Metrics]) -> Table:
+def _table(suite: str, settings: Settings, figures: Mapping[str, Metrics]) -> Table:
     content = results_table(suite, SUITES[suite].goal_oriented, figures)
-    table = Table(*content.header, title=f"{suite}: {SUITES[suite].title}", title_justify="left")
+    title = Text(f"{suite}: {describe_suite(suite, settings.scenes)}")
+    table = Table(*content.header, title=title, title_justify="left")
     for row in content.rows:
         cells = [f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row.cells]
         table.add_row(Text(row.label), *cells, style="dim" if row.published else None)

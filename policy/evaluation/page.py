@@ -12,7 +12,7 @@ import jinja2
 from policy.evaluation.benchmark import PICTURES, by_suite
 from policy.evaluation.metrics import BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED
 from policy.evaluation.report import Table, failures_table, results_table, scenes_table
-from policy.evaluation.suites import SUITES
+from policy.evaluation.suites import SUITES, describe_suite
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def write_page(folder: Path, settings: Settings, origin: Origin, results: Sequen
     html = environment.get_template("page.html.j2").render(
         settings=settings,
         origin=origin,
-        sections=_sections(folder, results),
+        sections=_sections(folder, settings, results),
         resamples=BOOTSTRAP_RESAMPLES,
         bootstrap_seed=BOOTSTRAP_SEED,
     )
@@ -75,18 +75,17 @@ def write_page(folder: Path, settings: Settings, origin: Origin, results: Sequen
     return path
 
 
-def _sections(folder: Path, results: Sequence[TrialResult]) -> list[_Section]:
+def _sections(folder: Path, settings: Settings, results: Sequence[TrialResult]) -> list[_Section]:
     sections = []
     for name, figures in by_suite(results).items():
         trials = [result for result in results if result.suite == name]
-        suite = SUITES[name]
         several = len({trial.scene for trial in trials}) > 1
         gallery, left_out = _gallery(folder, trials)
         sections.append(
             _Section(
                 name=name,
-                title=suite.title,
-                results=results_table(name, suite.goal_oriented, figures),
+                title=describe_suite(name, settings.scenes),
+                results=results_table(name, SUITES[name].goal_oriented, figures),
                 failures=failures_table(figures),
                 scenes=scenes_table(trials) if several else None,
                 gallery=gallery,

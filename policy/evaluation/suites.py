@@ -92,6 +92,14 @@ def find_suite(name: str, scenes: Path | None = None, meshes: Path | None = None
     return Suite(suite.title, cases, SUITES["challenging"].trials, suite.goal_oriented)
 
 
+def describe_suite(name: str, scenes: str | None) -> str:
+    """What a suite asks, in a few words; `scenes` is the folder of scene files that stand in for its own."""
+    suite = SUITES[name]
+    if scenes is None:
+        return suite.title
+    return f"{'the goal' if suite.goal_oriented else 'everything'} in the scenes of {scenes}"
+
+
 def scene_goal(path: Path, meshes: Path | None) -> str:
     """The colour of a scene file's goal: red where exactly one object is, otherwise what the file calls its goal.
 

@@ -100,7 +100,7 @@ class TrialResult:
         reason: why the job ended where it is not complete.
         actions, pushes, grasp_attempts, grasp_successes: as in `robotcell.journal.Metrics`.
         failures: how often each result that is no success occurred.
-        shown: the first failures, with pictures.
+        shown: failures with pictures: the first two and the last.
         simulated_s: on the cell's clock.
         wall_s: on this machine's.
         decision_s: median wall time of a decision, None without one.
@@ -245,7 +245,7 @@ class _Timed:
 
 @dataclass
 class _Watcher:
-    """An observer of the job that draws the first failures."""
+    """An observer of the job that draws failures."""
 
     config: CellConfig
     trial: Trial
@@ -270,8 +270,9 @@ class _Watcher:
         """Nothing has failed yet."""
 
     def ended(self, decision: Decision, outcome: Outcome) -> None:
-        """Draw an action that failed."""
-        if not outcome.success and len(self.failures) < _PICTURES:
+        """Draw an action that failed; of many, the first ones and the last."""
+        if not outcome.success:
+            del self.failures[_PICTURES - 1 :]
             page = draw_decision(decision, self.config, f"{describe(decision)}: {outcome.result.value}", _BAD)
             self._show(describe(decision), outcome.result.value, outcome.detail, page)
 

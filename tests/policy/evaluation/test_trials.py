@@ -78,3 +78,15 @@ def test_a_drawn_scene_whose_goal_lies_buried_is_drawn_anew():
     assert result.scene_seed == 1_000_000
     assert "--seed 1000000" in result.command
     assert result.objects == 30
+
+
+def test_of_many_failures_the_first_two_and_the_last_are_shown(tmp_path):
+    (tmp_path / "one.toml").write_text(toml(("goal", '"red"')))
+    # Nothing is wide enough to count as held.
+    case = Case("one.toml", str(tmp_path / "one.toml"), "red")
+    result, pictures = run_trial(trial(case, gripper__empty_width_m=0.05, gripper__preshape_m=0.055))
+    assert sum(result.failures.values()) > 3
+    assert [failure.action.split(".")[0] for failure in result.shown][:2] == ["1", "2"]
+    assert int(result.shown[2].action.split(".")[0]) > 3
+    assert {failure.picture for failure in result.shown} == set(pictures)
+    assert len(pictures) == 3
