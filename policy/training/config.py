@@ -111,17 +111,17 @@ class TrainConfig(_Table):
     collect: CollectSettings = CollectSettings()
     learning: LearningSettings = LearningSettings()
     stage1: StageSettings = StageSettings(
-        rounds=12,
-        scenes_per_round=24,
-        updates_per_round=200,
+        rounds=10,
+        scenes_per_round=36,
+        updates_per_round=120,
         warmup_rounds=2,
         exploration_start=0.6,
         exploration_end=0.15,
     )
     stage2: StageSettings = StageSettings(
-        rounds=10,
-        scenes_per_round=24,
-        updates_per_round=200,
+        rounds=8,
+        scenes_per_round=36,
+        updates_per_round=150,
         warmup_rounds=0,
         exploration_start=0.3,
         exploration_end=0.1,
