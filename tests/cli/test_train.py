@@ -80,7 +80,7 @@ def test_an_interrupt_says_how_to_go_on(config: Path, tmp_path: Path) -> None:
     config.write_text(CONFIG.replace("scenes_per_round = 2", "scenes_per_round = 100"))
     folder = tmp_path / "run"
     with subprocess.Popen(
-        command("--stage", 1, "--config", config, "--run", folder, "--workers", 2), stderr=subprocess.PIPE, text=True
+        command("--stage", 1, "--config", config, "--run", folder, "--workers", 1), stderr=subprocess.PIPE, text=True
     ) as process:
         while not list(folder.glob("stage1/shards/*.npz")):
             assert process.poll() is None
