@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,6 +21,8 @@ _PANELS: tuple[tuple[str, str, dict[str, str]], ...] = (
     ("Error", "mean |TD error|", {"td_error": "all attempts"}),
     ("Learning rate and exploration", "", {"learning_rate": "learning rate", "exploration": "exploration"}),
 )
+# Axes that run from 0 to 1.
+_PARTS = ("rewarded", "area under ROC")
 
 
 def draw_curves(history: Sequence[dict[str, float]], path: Path) -> None:
@@ -34,7 +37,10 @@ def draw_curves(history: Sequence[dict[str, float]], path: Path) -> None:
         for boundary in boundaries:
             axes.axvline(boundary, color="gray", linestyle="--", linewidth=1)
         axes.set(title=title, xlabel="round", ylabel=label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.grid(alpha=0.3)
+        if label in _PARTS:
+            axes.set_ylim(0, 1)
         axes.legend()
     figure.axes[-1].set_yscale("log")
     partial = path.with_suffix(".partial")
