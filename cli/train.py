@@ -84,9 +84,11 @@ def _train(
 
 def _line(metrics: dict[str, float]) -> str:
     """One round in words."""
+    rate = metrics["attempts_per_s"]
+    played = "played before" if math.isnan(rate) else f"{rate:.1f}/s"
     return (
         f"round {metrics['round'] + 1:.0f}/{metrics['rounds']:.0f}: "
-        f"{metrics['attempts']:.0f} attempts ({metrics['attempts_per_s']:.1f}/s), "
+        f"{metrics['attempts']:.0f} attempts ({played}), "
         f"grasps {_percent(metrics['grasp_success'])} (greedy {_percent(metrics['greedy_grasp_success'])}), "
         f"pushes {_percent(metrics['push_rewarded'])} | "
         f"loss {metrics['grasp_loss']:.3f} + {metrics['push_loss']:.3f}, |TD| {metrics['td_error']:.3f}, "

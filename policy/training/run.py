@@ -263,7 +263,7 @@ def _collect(
         "states": sum(len(shard.scene) for shard in shards),
         "attempts": sum(len(shard.state) for shard in shards),
         **_success(shards, stage),
-        "attempts_per_s": attempts / seconds,
+        "attempts_per_s": attempts / seconds if missing else math.nan,
         "collect_s": seconds,
     }
 
