@@ -1,4 +1,4 @@
-"""The network at work: from a heightmap to Q maps."""
+"""The network at work: from a heightmap to Q maps of all rotations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from policy.encoding import encode
+from policy.network import GRASP_ROTATIONS, PUSH_ROTATIONS
+from policy.precision import autocast
+from policy.rotation import MARGINS, Copies
 from policy.weights import load_weights
 
 if TYPE_CHECKING:
@@ -16,15 +18,16 @@ if TYPE_CHECKING:
 
     from torch import nn
 
-# Sides of the maps are filled up to a multiple of this, which the network halves four times.
-_MULTIPLE = 16
+GRASP, PUSH = 0, 1
+
+_PLANES = {GRASP: GRASP_ROTATIONS, PUSH: PUSH_ROTATIONS}
 
 
 class Inference:
     """A network in evaluation mode, ready to be asked.
 
     Args:
-        network: from encoded heightmaps to Q maps, see `policy.network.QNetwork`.
+        network: Q maps of grasps and pushes along +x, see `policy.network.QNetwork`.
     """
 
     def __init__(self, network: nn.Module) -> None:
@@ -41,18 +44,20 @@ class Inference:
         return Inference(load_weights(path)[0])
 
     def maps(
-        self, height_m: npt.NDArray[np.float32], color: npt.NDArray[np.uint8]
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Q maps of grasps (8, H, W) and pushes (16, H, W).
+        self, planes: npt.NDArray[np.float32], cells: npt.NDArray[np.bool_], primitive: int
+    ) -> npt.NDArray[np.float32]:
+        """Q maps (K, H, W) of a primitive, 8 for grasps and 16 for pushes; NaN outside of the cells.
 
         Args:
-            height_m: (H, W) [m] above the table, NaN = never seen.
-            color: (H, W, 3) uint8 RGB.
+            planes: (5, H, W) encoded heightmap.
+            cells: (H, W) that are asked for, at least one.
+            primitive: `GRASP` or `PUSH`.
         """
-        rows, cols = height_m.shape
-        planes = encode(height_m, color)
-        missing = ((0, 0), (0, -rows % _MULTIPLE), (0, -cols % _MULTIPLE))
-        x = torch.from_numpy(np.pad(planes, missing))[None].to(memory_format=torch.channels_last)
-        with torch.inference_mode():
-            grasp, push = self._network(x)
-        return grasp[0, :, :rows, :cols].numpy(), push[0, :, :rows, :cols].numpy()
+        rotations = _PLANES[primitive]
+        copies = Copies.around(cells, range(rotations), MARGINS[primitive])
+        x = torch.from_numpy(copies.turn(planes)).to(memory_format=torch.channels_last)
+        with torch.inference_mode(), autocast(x.device):
+            q = self._network(x)[:, primitive]
+        maps = np.full((rotations, *cells.shape), np.nan, np.float32)
+        maps[:, copies.rows, copies.cols] = copies.values(q.float().numpy())
+        return maps

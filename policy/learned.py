@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from policy.encoding import encode
+from policy.inference import GRASP, PUSH
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
 from policy.selection import best_cells, check_maps, push_mask, pushes, surface_at
@@ -20,11 +22,9 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from robotcell.decision import Observation
 
-# A push is taken when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside the
-# goal's mask is below a threshold), and ...
+# A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
+# the goal's mask is below a threshold).
 GRASP_THRESHOLD = 0.6
-# ... there is a push that promises more than this over what the grasp does.
-_PUSH_GAIN = 0.0
 
 
 class LearnedPolicy:
@@ -57,16 +57,13 @@ class LearnedPolicy:
         if not targets.any():
             what = "no object" if observation.goal is None else "no cell of the goal"
             raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
-        heightmap = observation.heightmap
-        height_m = close_gaps(heightmap.height_m)
-        grasp_q, push_q = self._inference.maps(heightmap.height_m, heightmap.color)
-        check_maps(grasp_q, "grasp")
-        check_maps(push_q, "push")
+        height_m = close_gaps(observation.heightmap.height_m)
+        planes = encode(height_m, observation.heightmap.color)
         may_push = observation.may_push and self._may_push
-        grasp = self._grasp(observation, grasp_q, targets, height_m)
+        grasp = self._grasp(observation, planes, targets, height_m)
         if may_push and (grasp is None or grasp.q_value < GRASP_THRESHOLD):
-            push = self._push(observation, push_q, targets, height_m)
-            if push is not None and (grasp is None or push.q_value > grasp.q_value + _PUSH_GAIN):
+            push = self._push(observation, planes, targets, height_m)
+            if push is not None and (grasp is None or push.q_value > grasp.q_value):
                 return push
         if grasp is not None:
             return grasp
@@ -78,10 +75,12 @@ class LearnedPolicy:
     def _grasp(
         self,
         observation: Observation,
-        q: npt.NDArray[np.float32],
+        planes: npt.NDArray[np.float32],
         targets: npt.NDArray[np.bool_],
         height_m: npt.NDArray[np.float32],
     ) -> Action | None:
+        q = self._inference.maps(planes, targets, GRASP)
+        check_maps(q, targets, "grasp")
         mask = _allowed(Primitive.GRASP, observation, targets, len(q))
         for k, row, col, value in best_cells(q, mask, 1):
             z = self._table_height_m + surface_at(height_m, (row, col))
@@ -91,13 +90,15 @@ class LearnedPolicy:
     def _push(
         self,
         observation: Observation,
-        q: npt.NDArray[np.float32],
+        planes: npt.NDArray[np.float32],
         targets: npt.NDArray[np.bool_],
         height_m: npt.NDArray[np.float32],
     ) -> Action | None:
         workspace = observation.heightmap.workspace
         free = free_to_descend(height_m, workspace)
         mask = push_mask(targets, observation.objects)
+        q = self._inference.maps(planes, mask, PUSH)
+        check_maps(q, mask, "push")
         for k, value, line in pushes(q, mask, height_m, free, self._push_m, workspace.resolution_m):
             x, y = self._position(observation, line.row, line.col)
             at = np.array([x]), np.array([y])

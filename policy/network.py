@@ -1,14 +1,14 @@
-"""The network: one pass over the RGB-D heightmap gives dense Q maps of all rotations at the heightmap's resolution.
+"""The network: Q maps of grasping and pushing along +x of the map that it is shown.
 
-A shared perception (an encoder and a decoder with skip connections) feeds a grasp module and a push module. It works
-on blocks of 2 x 2 cells and ends by unfolding them again, so its maps are as fine as the heightmap at a quarter of the
-cost. The rotations are output channels: the paper rotates the input 16 times instead (`policy.paper_network`).
+A shared perception (an encoder and a decoder with skip connections) feeds a grasp module and a push module. The other
+directions come from turning the map (`policy.rotation`), so that everything learned of one holds for all.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from torch import nn
 from torch.nn import functional
 
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
 GRASP_ROTATIONS = ROTATIONS // 2
 PUSH_ROTATIONS = ROTATIONS
 
-_FOLD = 2
-_WIDTHS = (32, 48, 96, 128)
+# The network works on blocks of 4 x 4 cells (8 mm), with all that is in them as channels.
+_FOLD = 4
+_WIDTHS = (32, 48, 80)
 
 
 class QNetwork(nn.Module):
-    """Q maps of grasps and pushes from encoded heightmaps.
+    """Q maps (B, 2, H, W) of grasps and of pushes along +x, from encoded heightmaps (B, 5, H, W) float32.
 
-    `forward` takes (B, 5, H, W) float32 (`policy.encoding.encode`; H and W multiples of 16) and returns the Q maps of
-    grasps (B, 8, H, W), plane k closing along k * 22.5 degrees, and of pushes (B, 16, H, W), plane k pushing along it.
+    See `policy.encoding.encode` for the input; H and W are multiples of 16.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        a, b, c, d = _WIDTHS
-        self.stem = _block(CHANNELS * _FOLD**2, a)
-        self.down = nn.ModuleList([_Down(a, b), _Down(b, c), _Down(c, d)])
-        self.up = nn.ModuleList([_Up(d, c, c), _Up(c, b, b), _Up(b, a, a)])
-        self.grasp = _head(a, GRASP_ROTATIONS)
-        self.push = _head(a, PUSH_ROTATIONS)
+        a, b, c = _WIDTHS
+        self.stem = nn.Sequential(_block(CHANNELS * _FOLD**2, a), _Residual(a))
+        self.down = nn.ModuleList([_Down(a, b), _Down(b, c)])
+        self.up = nn.ModuleList([_Up(c, b, b), _Up(b, a, a)])
+        self.grasp = _head(a)
+        self.push = _head(a)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor) -> Tensor:
         """See the class."""
         features = self.stem(functional.pixel_unshuffle(x, _FOLD))
         skips = []
@@ -51,7 +51,8 @@ class QNetwork(nn.Module):
             features = down(features)
         for up in self.up:
             features = up(features, skips.pop())
-        return self.grasp(features), self.push(features)
+        q = torch.cat([self.grasp(features), self.push(features)], dim=1)
+        return _enlarge(q, _FOLD)
 
 
 def _block(inputs: int, outputs: int) -> nn.Sequential:
@@ -89,16 +90,13 @@ class _Up(nn.Module):
         self.body = nn.Sequential(_block(2 * skip, outputs), _Residual(outputs))
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        from torch import cat
-
-        grown = functional.interpolate(self.narrow(x), scale_factor=2, mode="bilinear", align_corners=False)
-        y: Tensor = self.body(cat([grown, skip], dim=1))
+        y: Tensor = self.body(torch.cat([_enlarge(self.narrow(x)), skip], dim=1))
         return y
 
 
-def _head(width: int, rotations: int) -> nn.Sequential:
-    return nn.Sequential(
-        _block(width, width),
-        nn.Conv2d(width, rotations * _FOLD**2, 1),
-        nn.PixelShuffle(_FOLD),
-    )
+def _head(width: int) -> nn.Sequential:
+    return nn.Sequential(_block(width, width), nn.Conv2d(width, 1, 1))
+
+
+def _enlarge(x: Tensor, factor: int = 2) -> Tensor:
+    return functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)

@@ -26,18 +26,19 @@ _PUSH_TRIES = 2000
 _FLAT = 1e-6
 
 
-def check_maps(q: npt.NDArray[np.float32], name: str) -> None:
-    """Refuse Q maps (K, H, W) that no action can be read from.
+def check_maps(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], name: str) -> None:
+    """Refuse Q maps (K, H, W) that no action can be read from inside a mask (H, W).
 
     Raises:
         ConfigError: they are empty, not finite, or the same everywhere.
     """
-    if not q.size:
-        problem = f"are empty, of shape {q.shape}"
-    elif not np.isfinite(q).all():
-        problem = f"hold {np.count_nonzero(~np.isfinite(q))} values that are not finite"
-    elif np.ptp(q) < _FLAT:
-        problem = f"are flat, every value is {float(q.flat[0]):.4g}"
+    values = q[:, mask]
+    if not values.size:
+        problem = f"are empty, of shape {q.shape} with {np.count_nonzero(mask)} cells asked for"
+    elif not np.isfinite(values).all():
+        problem = f"hold {np.count_nonzero(~np.isfinite(values))} values that are not finite"
+    elif np.ptp(values) < _FLAT:
+        problem = f"are flat, every value is {float(values.flat[0]):.4g}"
     else:
         return
     raise ConfigError(f"the network's {name} maps {problem}: its weights are broken; choose others, or train again")

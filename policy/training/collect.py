@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from policy.encoding import encode
 from policy.grasping import Jaw, find_grasps, lay_table
 from policy.push_line import push_line
 from policy.selection import best_cells, push_mask
@@ -106,7 +107,7 @@ class _Book:
     def shard(self) -> Shard:
         column = list(zip(*self.rows, strict=True)) or [()] * 11
         return Shard(
-            height=np.stack([pack_height(s.heightmap.height_m) for s in self.states]),
+            height=np.stack([pack_height(s.height_m) for s in self.states]),
             color=np.stack([s.heightmap.color for s in self.states]),
             labels=np.stack([s.labels for s in self.states]),
             scene=np.array(self.scenes, np.int32),
@@ -169,8 +170,8 @@ def _play(
         known = None
         maps = None
         if network is not None:
-            grasp, push = network.maps(state.heightmap.height_m, state.heightmap.color)
-            maps = _Maps(grasp, push)
+            planes = encode(state.height_m, state.heightmap.color)
+            maps = _Maps(*(network.maps(planes, state.labels > 0, primitive) for primitive in (GRASP, PUSH)))
         picks: list[_Choice] = []
         useful: list[_Choice] = []
         for choice in _choices(state, maps, collection, config, rng):

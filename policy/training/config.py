@@ -75,24 +75,21 @@ class StageSettings(_Table):
 class LearningSettings(_Table):
     """Double DQN with prioritised replay."""
 
-    # States per update; each brings all that was tried in it.
-    batch: Count = 8
-    # Side of the square that is cut out of each state around its attempts; 160 of 224 cells take half the time.
-    crop_cells: Annotated[int, Field(ge=32, multiple_of=16)] = 160
+    # Attempts of each primitive in an update.
+    grasps: Count = 32
+    pushes: Count = 24
     # Adam; follows half a cosine from the first to the last update of a stage.
     learning_rate: Positive = 1e-3
     final_learning_rate: Positive = 1e-4
     gradient_norm: Positive = 5.0
     # Paper: "gamma = 0.5".
     gamma: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    # Updates between two copies of the network to the target network.
-    target_sync: Count = 200
     # Exponents of prioritised replay; beta grows from its start to 1 over a stage.
     priority_alpha: Probability = 0.6
     priority_beta_start: Probability = 0.4
     push_weight: Positive = 1.0
-    # States after a push that an update evaluates for each state of its batch.
-    next_states: Count = 1
+    # States after a push that are valued anew in a round, at least; all that were not valued yet come first.
+    values_per_round: Count = 600
     # States in memory; the oldest shards are left out. A state of 224 x 224 cells takes 0.3 MB.
     capacity_states: Count = 16_000
 
@@ -113,15 +110,15 @@ class TrainConfig(_Table):
     stage1: StageSettings = StageSettings(
         rounds=10,
         scenes_per_round=36,
-        updates_per_round=120,
+        updates_per_round=250,
         warmup_rounds=2,
         exploration_start=0.6,
         exploration_end=0.15,
     )
     stage2: StageSettings = StageSettings(
         rounds=8,
-        scenes_per_round=36,
-        updates_per_round=150,
+        scenes_per_round=24,
+        updates_per_round=300,
         warmup_rounds=0,
         exploration_start=0.3,
         exploration_end=0.1,

@@ -338,7 +338,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         self._goal = int(self.np_random.choice(seen)) if self._stage == 2 and len(seen) else 0
 
     def _observation(self) -> npt.NDArray[np.float32]:
-        return encode(self.state.heightmap.height_m, self.state.heightmap.color)
+        return encode(self.state.height_m, self.state.heightmap.color)
 
     def _info(self) -> dict[str, Any]:
         return {"labels": self.state.labels, "goal": self._goal}

@@ -1,10 +1,9 @@
-"""Double DQN on dense Q maps."""
+"""Double DQN on dense Q maps, learned from the surroundings of single attempts."""
 
 from __future__ import annotations
 
 import copy
 import math
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,20 +14,21 @@ from scipy.stats import rankdata
 from torch.nn import functional
 
 from policy.encoding import encode
-from policy.selection import push_mask
-from policy.training.augment import augment
+from policy.network import GRASP_ROTATIONS
+from policy.precision import autocast
+from policy.rotation import MARGINS, Copies
+from policy.training.augment import crop
 from policy.training.shard import GRASP, PUSH, unpack_height
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from contextlib import AbstractContextManager
+    from collections.abc import Callable
 
     from torch import Tensor, nn
 
     from policy.training.config import LearningSettings
-    from policy.training.replay import Replay, Sample, View
+    from policy.training.replay import Replay, View
 
-_VALIDATION_BATCH = 8
+_VALIDATION_BATCH = 64
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class Learner:
     Args:
         network: the online network, in whatever state it is to start from.
         settings: of the learning.
-        stage: 1 or 2; in stage 2 the best next action is sought at the target object only.
+        stage: 1 or 2, which seeds the draws.
         planned_updates: of the stage; learning rate and beta follow them.
-        seed: makes what is drawn and how it is augmented a function of the number of the update.
+        seed: makes what is drawn and how it is varied a function of the number of the update.
     """
 
     def __init__(
@@ -80,41 +80,42 @@ class Learner:
         return last + (first - last) * (1 + math.cos(math.pi * self.progress)) / 2
 
     def update(self, replay: Replay) -> Losses:
-        """Draw a batch, learn from it, and tell the replay how wrong the network was."""
+        """Draw attempts, learn from them, and tell the replay how wrong the network was."""
         settings = self._settings
         rng = np.random.default_rng([self._seed, self._stage, self.updates])
         beta = settings.priority_beta_start + (1 - settings.priority_beta_start) * self.progress
-        indices, weights = replay.draw(settings.batch, beta, rng)
-        samples = [
-            augment(replay.sample(int(index), settings.next_states, rng), settings.crop_cells, rng) for index in indices
-        ]
-        losses, errors = self.learn(samples, weights)
-        known = ~np.isnan(errors)
-        replay.update(indices[known], errors[known])
+        counts = {GRASP: settings.grasps, PUSH: settings.pushes}
+        drawn = [replay.draw(kind, count, beta, rng) for kind, count in counts.items()]
+        numbers = np.concatenate([rows for rows, _ in drawn])
+        importance = np.concatenate([weights for _, weights in drawn])
+        attempts = replay.attempts.take(numbers)
+        wanted = attempts.reward + np.float32(settings.gamma) * replay.value[numbers]
+        losses, errors = self.learn(_crops(replay, numbers, rng), attempts.primitive, wanted, importance)
+        replay.update(numbers, errors)
         return losses
 
     def learn(
-        self, samples: Sequence[Sample], weights: npt.NDArray[np.float32]
+        self,
+        crops: npt.NDArray[np.float32],
+        primitive: npt.NDArray[np.int64],
+        wanted: npt.NDArray[np.float32],
+        importance: npt.NDArray[np.float32],
     ) -> tuple[Losses, npt.NDArray[np.float32]]:
         """One step of Adam.
 
         Args:
-            samples: B states with their attempts.
-            weights: (B,) importance of each.
+            crops: (N, 5, S, S) surroundings of the attempts.
+            primitive: (N,) of the attempts.
+            wanted: (N,) Q values.
+            importance: (N,) weights.
 
         Returns:
-            The losses, and (B,) the mean |TD error| of each sample; NaN for one that has no attempts left.
+            The losses, and (N,) the |TD error| of each attempt.
         """
-        targets = self.targets(samples)
-        owner = np.repeat(np.arange(len(samples)), [len(sample.reward) for sample in samples])
-        primitive = np.concatenate([sample.primitive for sample in samples])
         self.online.train()
-        with _autocast(self.device):
-            grasp, push = self.online(self._encode([sample.view for sample in samples]))
-        chosen = _at_attempts(grasp.float(), push.float(), samples)
-        wanted = targets.to(self.device)
-        importance = torch.from_numpy(weights[owner]).to(self.device)
-        each = importance * functional.smooth_l1_loss(chosen, wanted, reduction="none")
+        chosen = self._at_middle(self.online, crops, primitive)
+        goal, weight = (torch.from_numpy(values).to(self.device) for values in (wanted, importance))
+        each = weight * functional.smooth_l1_loss(chosen, goal, reduction="none")
         grasps, pushes = (each[torch.from_numpy(primitive == kind).to(self.device)] for kind in (GRASP, PUSH))
         # A batch may lack one of them: its sum is 0 then, and its mean not a number.
         loss = grasps.sum() / max(1, len(grasps)) + self._settings.push_weight * pushes.sum() / max(1, len(pushes))
@@ -125,67 +126,75 @@ class Learner:
         torch.nn.utils.clip_grad_norm_(self.online.parameters(), self._settings.gradient_norm)
         self.optimizer.step()
         self.updates += 1
-        if self.updates % self._settings.target_sync == 0:
-            self.target.load_state_dict(self.online.state_dict())
-        errors = (chosen.detach() - wanted).abs().cpu().numpy()
-        sums = np.bincount(owner, weights=errors, minlength=len(samples))
-        count = np.bincount(owner, minlength=len(samples))
-        mean = np.divide(sums, count, out=np.full(len(samples), np.nan), where=count > 0)
+        errors = (chosen.detach() - goal).abs().cpu().numpy()
         grasp_loss, push_loss = (_mean(values.detach().cpu().numpy()) for values in (grasps, pushes))
-        losses = Losses(grasp_loss, push_loss, _mean(errors))
-        return losses, mean.astype(np.float32)
+        return Losses(grasp_loss, push_loss, _mean(errors)), errors
 
-    @torch.no_grad()
-    def targets(self, samples: Sequence[Sample]) -> Tensor:
-        """(N,) float32 of all attempts in their order: y = r + gamma Q_target(s', argmax_a Q_online(s', a)).
+    def look_ahead(
+        self, replay: Replay, round_: int, on_progress: Callable[[int, int], None] = lambda _done, _total: None
+    ) -> None:
+        """Find what can be reached after the pushes that were not valued yet, and after those valued longest ago.
 
-        The maximum runs over grasps at the object (stage 1: at all objects) and pushes of what is within 30 mm of it.
-        y = r where the attempt ended its episode or nothing is left to act on.
+        The value is that of Double DQN, Q_target(s', argmax_a Q_online(s', a)) over the actions at the cells of the
+        object that the attempt was about. The target network then becomes a copy of the online one, so the two that
+        are asked are a round apart.
+
+        Args:
+            replay: of the attempts.
+            round_: in which this happens.
+            on_progress: told how many are done, of how many.
         """
-        targets = torch.from_numpy(np.concatenate([sample.reward for sample in samples])).float()
-        views = [view for sample in samples for view in sample.views_after]
-        if not views:
-            return targets
+        attempts = replay.attempts
+        open_ = np.flatnonzero((attempts.next_state >= 0) & ~attempts.held_out)
+        oldest = open_[np.argsort(replay.valued[open_], kind="stable")]
+        never = int((replay.valued[open_] < 0).sum())
+        chosen = oldest[: max(never, self._settings.values_per_round)]
+        rng = np.random.default_rng([self._seed, self._stage, round_, 1])
         self.online.eval()
-        encoded = self._encode(views)
-        with _autocast(self.device):
-            online, target = (network(encoded) for network in (self.online, self.target))
-        # Which object's future a state is worth depends on the attempt, so each pair of both is looked up once.
-        values: dict[tuple[int, int], float] = {}
-        first_attempt = first_view = 0
-        for sample in samples:
-            for i in np.flatnonzero(sample.following >= 0):
-                view = first_view + int(sample.following[i])
-                goal = int(sample.target[i]) if self._stage == 2 else 0
-                if (view, goal) not in values:
-                    values[view, goal] = _double_q(
-                        tuple(maps[view].float() for maps in online),
-                        tuple(maps[view].float() for maps in target),
-                        views[view].labels,
-                        goal,
-                    )
-                targets[first_attempt + i] += self._settings.gamma * values[view, goal]
-            first_attempt += len(sample.reward)
-            first_view += len(sample.views_after)
-        return targets
+        found: dict[tuple[int, int, int], float] = {}
+        for done, number in enumerate(chosen.tolist()):
+            key = (int(attempts.shard[number]), int(attempts.next_state[number]), int(attempts.target[number]))
+            if key not in found:
+                found[key] = self.value(replay.view(*key[:2]), key[2], rng)
+            replay.value[number], replay.valued[number] = found[key], round_
+            on_progress(done + 1, len(chosen))
+        self.target.load_state_dict(self.online.state_dict())
 
     @torch.no_grad()
-    def validate(self, samples: Sequence[Sample]) -> dict[str, float]:
-        """How well the Q values tell rewarded from unrewarded attempts: `grasp_auc` and `push_auc`."""
+    def value(self, view: View, goal: int, rng: np.random.Generator) -> float:
+        """Q_target of the action at an object that Q_online likes best; 0 if it is not seen.
+
+        Of the directions of a push only one half, drawn at random, is looked at: they come with the eight rotations
+        that a grasp needs.
+        """
+        cells = view.labels == goal
+        if not cells.any():
+            return 0.0
+        first = int(rng.integers(2)) * GRASP_ROTATIONS
+        copies = Copies.around(cells, range(first, first + GRASP_ROTATIONS), MARGINS[GRASP])
+        turned = copies.turn(encode(unpack_height(view.height), view.color))
+        x = torch.from_numpy(turned).to(self.device, memory_format=torch.channels_last)
+        with autocast(self.device):
+            online, target = (network(x).float().cpu().numpy() for network in (self.online, self.target))
+        values = [
+            np.stack([copies.values(maps[:, primitive]) for primitive in (GRASP, PUSH)]) for maps in (online, target)
+        ]
+        return double_q(*values)
+
+    @torch.no_grad()
+    def validate(self, replay: Replay, newest: int) -> dict[str, float]:
+        """How well the Q values tell rewarded from unrewarded held-out attempts: `grasp_auc` and `push_auc`."""
         self.online.eval()
-        values = []
-        for start in range(0, len(samples), _VALIDATION_BATCH):
-            batch = samples[start : start + _VALIDATION_BATCH]
-            with _autocast(self.device):
-                grasp, push = self.online(self._encode([sample.view for sample in batch]))
-            values.append(_at_attempts(grasp.float(), push.float(), batch).cpu().numpy())
-        if not values:
-            return {"grasp_auc": math.nan, "push_auc": math.nan}
-        value = np.concatenate(values)
-        rewarded = np.concatenate([sample.reward for sample in samples]) > 0
-        primitive = np.concatenate([sample.primitive for sample in samples])
+        numbers = replay.validation(newest)
+        attempts = replay.attempts.take(numbers)
+        parts = [numbers[i : i + _VALIDATION_BATCH] for i in range(0, len(numbers), _VALIDATION_BATCH)]
+        values = [
+            self._at_middle(self.online, _crops(replay, part, None), replay.attempts.primitive[part]).cpu().numpy()
+            for part in parts
+        ]
+        value = np.concatenate([np.empty(0, np.float32), *values])
         return {
-            f"{name}_auc": auc(value[primitive == kind], rewarded[primitive == kind])
+            f"{name}_auc": auc(value[attempts.primitive == kind], attempts.reward[attempts.primitive == kind] > 0)
             for name, kind in (("grasp", GRASP), ("push", PUSH))
         }
 
@@ -205,9 +214,21 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         self.updates = state["updates"]
 
-    def _encode(self, views: Sequence[View]) -> Tensor:
-        encoded = np.stack([encode(unpack_height(view.height), view.color) for view in views])
-        return torch.from_numpy(encoded).to(self.device, memory_format=torch.channels_last)
+    def _at_middle(
+        self, network: nn.Module, crops: npt.NDArray[np.float32], primitive: npt.NDArray[np.int64]
+    ) -> Tensor:
+        """(N,) the Q values in the middle of crops (N, 5, S, S)."""
+        x = torch.from_numpy(crops).to(self.device, memory_format=torch.channels_last)
+        with autocast(self.device):
+            q = network(x)
+        middle = crops.shape[-1] // 2
+        chosen: Tensor = q.float()[torch.arange(len(x)), torch.from_numpy(primitive), middle, middle]
+        return chosen
+
+
+def double_q(online: npt.NDArray[np.float32], target: npt.NDArray[np.float32]) -> float:
+    """The target network's value of the action that the online network likes best; arrays of the same shape."""
+    return float(target.flat[int(online.argmax())])
 
 
 def auc(values: npt.NDArray[np.float32], positive: npt.NDArray[np.bool_]) -> float:
@@ -220,57 +241,16 @@ def auc(values: npt.NDArray[np.float32], positive: npt.NDArray[np.bool_]) -> flo
     return float((ranks[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives))
 
 
-def _at_attempts(grasp: Tensor, push: Tensor, samples: Sequence[Sample]) -> Tensor:
-    """(N,) the Q values of all attempts, in their order."""
-    owner = np.repeat(np.arange(len(samples)), [len(sample.reward) for sample in samples])
-    kind, plane, row, col = (
-        np.concatenate([getattr(sample, name) for sample in samples]).astype(np.int64)
-        for name in ("primitive", "rotation", "row", "col")
+def _crops(replay: Replay, numbers: npt.NDArray[np.int64], rng: np.random.Generator | None) -> npt.NDArray[np.float32]:
+    """(N, 5, S, S) the surroundings of attempts, varied where there is an `rng`."""
+    each = zip(*replay.attempts.take(numbers)[:7], strict=True)
+    return np.stack(
+        [
+            crop(replay.view(int(shard), int(state)), int(kind), (int(row), int(col)), int(rotation), rng)
+            for shard, state, _, kind, row, col, rotation in each
+        ]
     )
-    maps = torch.cat([grasp, push], dim=1)
-    plane = plane + np.where(kind == PUSH, grasp.shape[1], 0)
-    places = (torch.from_numpy(index).to(maps.device) for index in (owner, plane, row, col))
-    return maps[tuple(places)]
 
 
 def _mean(values: npt.NDArray[np.float32]) -> float:
     return float(values.mean()) if len(values) else math.nan
-
-
-def _double_q(
-    online: tuple[Tensor, ...], target: tuple[Tensor, ...], labels: npt.NDArray[np.uint8], goal: int
-) -> float:
-    """Q_target of the action that Q_online likes best among those that concern the goal; 0 if it is not seen.
-
-    Args:
-        online: Q maps of grasps and pushes of one state, (planes, H, W) each.
-        target: the same of the target network.
-        labels: (H, W) of the objects.
-        goal: label of the goal; 0 for any object.
-    """
-    objects = labels > 0
-    mask = labels == goal if goal else objects
-    if not mask.any():
-        return 0.0
-    device = online[0].device
-    best, value = -math.inf, 0.0
-    for online_maps, target_maps, cells in zip(online, target, (mask, push_mask(mask, objects)), strict=True):
-        flat = torch.from_numpy(np.flatnonzero(cells)).to(device)
-        candidates = online_maps.flatten(1)[:, flat].flatten()
-        choice = int(candidates.argmax())
-        if float(candidates[choice]) > best:
-            best = float(candidates[choice])
-            value = float(target_maps.flatten(1)[:, flat].flatten()[choice])
-    return value
-
-
-def _autocast(device: torch.device) -> AbstractContextManager[None]:
-    """bfloat16 where the processor has instructions for it; losses stay float32."""
-    if device.type == "cuda" or _cpu_has_bfloat16():
-        return torch.autocast(device.type, torch.bfloat16)
-    return nullcontext()
-
-
-def _cpu_has_bfloat16() -> bool:
-    abilities = torch.cpu.get_capabilities()
-    return bool(abilities.get("avx512_bf16") or abilities.get("amx_bf16") or abilities.get("bf16"))

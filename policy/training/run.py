@@ -17,6 +17,7 @@ import shutil
 import time
 import zipfile
 from contextlib import closing
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,8 +45,8 @@ if TYPE_CHECKING:
     # (what is being done, how much of it is done, of how much)
     Progress = Callable[[str, int, int], None]
 
-# Held-out states that each round is measured on, the newest.
-_VALIDATION_STATES = 256
+# Held-out attempts that each round is measured on, the newest.
+_VALIDATION_ATTEMPTS = 3000
 
 
 def train(
@@ -184,8 +185,9 @@ def _train(
     played = [path for path in _shard_paths(folder) if _round_of(path) < first]
     replay.extend(_newest([*earlier, *played], config.learning.capacity_states))
     if checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
-        # Somebody may have deleted a shard; then all states are as new.
+        # Somebody may have deleted a shard; then all attempts are as new.
         replay.priorities = checkpoint["priorities"].numpy()
+        replay.value, replay.valued = checkpoint["value"].numpy(), checkpoint["valued"].numpy()
     _write_weights(run, folder, config, stage, learner, history)
     for round_ in range(first, plan.rounds):
         start = time.perf_counter()
@@ -196,6 +198,7 @@ def _train(
                 f"{folder / 'shards'}: the scenes of round {round_} gave nothing to learn from; set a larger "
                 "scenes_per_round, collect.grasps or collect.pushes, and train into another --run folder"
             )
+        learner.look_ahead(replay, round_, partial(on_progress, "look ahead"))
         learned = _learn(learner, replay, plan.updates_per_round * (round_ + 1), on_progress)
         metrics: Metrics = {
             "stage": stage,
@@ -204,14 +207,18 @@ def _train(
             "exploration": config.exploration(stage, round_),
             **collected,
             **learned,
-            **learner.validate(replay.validation(_VALIDATION_STATES)),
+            **learner.validate(replay, _VALIDATION_ATTEMPTS),
             "hours": (history[-1]["hours"] if history else 0.0) + (time.perf_counter() - start) / 3600,
         }
         history.append(metrics)
         # The metrics first: a round without a checkpoint is done again, and its line is written anew.
         _write_metrics(run, history)
         state = {"rounds": round_ + 1, "stage": stage, "config": config.model_dump_json()}
-        state["priorities"] = torch.from_numpy(replay.priorities)
+        state |= {
+            "priorities": torch.from_numpy(replay.priorities),
+            "value": torch.from_numpy(replay.value),
+            "valued": torch.from_numpy(replay.valued),
+        }
         save_checkpoint(folder / "checkpoint.pt", {**learner.state(), **state})
         _write_weights(run, folder, config, stage, learner, history)
         draw_curves(history, run / "curves.png")

@@ -23,7 +23,7 @@ class Shard:
     """S states and N attempts; heightmaps are (H, W).
 
     Attributes:
-        height: (S, H, W) uint16, see `pack_height`.
+        height: (S, H, W) uint16 with closed gaps, see `pack_height`.
         color: (S, H, W, 3) uint8 RGB.
         labels: (S, H, W) uint8, the object whose cell it is (simulator's truth, 1..), 0 = none. An object has the
             same number in all states of its scene.
