@@ -1,4 +1,4 @@
-"""The network in the paper's form: two DenseNet-121 trunks see 16 rotated copies of the heightmap.
+"""The network in the paper's form: two DenseNet-121 trunks on the doubled heightmap.
 
 It exists to be compared with `policy.network`, which gives the same maps at a small share of the cost. The text of the
 paper leaves open, and here it is settled as follows:
@@ -11,9 +11,9 @@ paper leaves open, and here it is settled as follows:
   the classifier would.
 - The modules halve the 2048 channels to 1024, and narrow these and 2 x 512 of the skip to 64; both convolutions are
   followed by norm and ReLU. This brings the count to 18.37 M.
-- A copy is rotated and doubled by one bilinear resampling with zeros around the map.
-- All 16 copies pass the trunks and both modules. A grasp and the same grasp after half a turn are one grasp: its Q
-  value is the mean over the two copies.
+- The 16 rotated copies are those of `policy.rotation`, which show the surroundings of the cells that are asked for; the
+  paper's show the whole map (320 x 320 cells, doubled to 640 x 640). A grasp and the same grasp after half a turn are
+  one grasp, looked for in one of the two copies.
 - Weights start as PyTorch initialises layers by default. The paper starts from ImageNet's, which are not shipped here.
 
 DenseNet: Huang, Liu, van der Maaten, Weinberger, "Densely Connected Convolutional Networks", CVPR 2017, table 1.
@@ -21,16 +21,11 @@ DenseNet: Huang, Liu, van der Maaten, Weinberger, "Densely Connected Convolution
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
-
-from policy.network import GRASP_ROTATIONS
-from robotcell.decision import ROTATIONS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,17 +47,12 @@ _COARSE = 1024
 _WIDTHS = (1024, 64)
 _UPSAMPLING = 4
 _DOUBLING = 2
-# Stride of the coarse features in cells.
-_STRIDE = 16
 
 
 class PaperNetwork(nn.Module):
-    """Q maps of grasps and pushes from encoded heightmaps, one rotated copy after the other.
+    """Q maps (B, 2, H, W) of grasps and of pushes along +x, from encoded heightmaps (B, 5, H, W) float32.
 
-    `forward` takes and returns what `policy.network.QNetwork` does: (B, 5, H, W) float32 to (B, 8, H, W) of grasps and
-    (B, 16, H, W) of pushes; any H and W will do. Where gradients are recorded, each copy is computed a second time in
-    the backward pass, for the activations of 16 copies do not fit into memory; the running statistics of the norms
-    then count each batch twice.
+    As `policy.network.QNetwork`: see `policy.encoding.encode` for the input; H and W are multiples of 16.
     """
 
     def __init__(self) -> None:
@@ -72,42 +62,13 @@ class PaperNetwork(nn.Module):
         self.grasp = _Module()
         self.push = _Module()
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, x: Tensor) -> Tensor:
         """See the class."""
-        copies = [
-            checkpoint(self._copy, x, k, use_reentrant=False) if torch.is_grad_enabled() else self._copy(x, k)
-            for k in range(ROTATIONS)
-        ]
-        grasp = torch.stack([g for g, _ in copies], dim=1)
-        push = torch.stack([p for _, p in copies], dim=1)
-        return (grasp[:, :GRASP_ROTATIONS] + grasp[:, GRASP_ROTATIONS:]) / 2, push
-
-    def _copy(self, x: Tensor, k: int) -> tuple[Tensor, Tensor]:
-        """Q maps (B, H, W) of rotation k: in its copy of the map, the action runs along +x."""
-        rows, cols = x.shape[2:]
-        # Holds the map at every rotation (224 -> 320).
-        side = math.ceil(math.hypot(rows, cols) / _STRIDE) * _STRIDE
-        theta = 2 * math.pi * k / ROTATIONS
-        cos, sin = math.cos(theta), math.sin(theta)
-        # Both in units of the half sides of what is sampled and of what results.
-        out = [[side * cos / cols, -side * sin / cols, 0.0], [side * sin / rows, side * cos / rows, 0.0]]
-        back = [[cols * cos / side, rows * sin / side, 0.0], [-cols * sin / side, rows * cos / side, 0.0]]
-        copy = _resample(x, out, (_DOUBLING * side, _DOUBLING * side))
-        # Convolutions on the processor are faster on channels that lie together in memory.
-        color = self.color(copy[:, _COLOR].contiguous(memory_format=torch.channels_last))
-        height = self.height(copy[:, _HEIGHT].expand(-1, 3, -1, -1).contiguous(memory_format=torch.channels_last))
+        doubled = _enlarge(x, _DOUBLING)
+        color = self.color(doubled[:, _COLOR])
+        height = self.height(doubled[:, _HEIGHT].expand(-1, 3, -1, -1))
         fine, coarse = (torch.cat(pair, dim=1) for pair in zip(color, height, strict=True))
-        q = torch.cat([self.grasp(fine, coarse), self.push(fine, coarse)], dim=1)
-        grasp, push = _resample(q, back, (rows, cols)).unbind(dim=1)
-        return grasp, push
-
-
-def _resample(maps: Tensor, affine: list[list[float]], size: tuple[int, int]) -> Tensor:
-    """Sample maps (B, C, *, *) at `affine` (2 x 3) of the cells of a map of the given size; zero outside."""
-    grid = functional.affine_grid(
-        maps.new_tensor(affine).expand(len(maps), -1, -1), [*maps.shape[:2], *size], align_corners=False
-    )
-    return functional.grid_sample(maps, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+        return torch.cat([self.grasp(fine, coarse), self.push(fine, coarse)], dim=1)
 
 
 class _Module(nn.Module):
@@ -121,8 +82,8 @@ class _Module(nn.Module):
         self.last = nn.Conv2d(narrow, 1, 1)
 
     def forward(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        x = self.second(torch.cat([_enlarge(self.first(coarse)), fine], dim=1))
-        y: Tensor = self.last(_enlarge(x))
+        x = self.second(torch.cat([_enlarge(self.first(coarse), _UPSAMPLING), fine], dim=1))
+        y: Tensor = self.last(_enlarge(x, _UPSAMPLING))
         return y
 
 
@@ -134,8 +95,8 @@ def _narrow(inputs: int, outputs: int) -> nn.Sequential:
     )
 
 
-def _enlarge(x: Tensor) -> Tensor:
-    return functional.interpolate(x, scale_factor=_UPSAMPLING, mode="bilinear", align_corners=False)
+def _enlarge(x: Tensor, factor: int) -> Tensor:
+    return functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
 
 
 class _Trunk(nn.Module):
