@@ -60,7 +60,8 @@ class Copies:
     def around(cells: npt.NDArray[np.bool_], rotations: range, margin: int) -> Copies:
         """Copies that show all the cells of a mask (H, W), which is not empty, and `margin` cells around them."""
         rows, cols = np.nonzero(cells)
-        center = (float(rows.min() + rows.max()) / 2, float(cols.min() + cols.max()) / 2)
+        # Whole cells: so quarter turns bring cells onto cells.
+        center = (int(rows.min() + rows.max()) // 2, int(cols.min() + cols.max()) // 2)
         turns = np.stack([turn_matrix(k, center, (0.0, 0.0)) for k in rotations])
         reach = np.abs(turns @ np.stack([cols, rows, np.ones(len(rows))])).max() + margin
         side = math.ceil(2 * reach / _MULTIPLE) * _MULTIPLE
@@ -81,4 +82,5 @@ class Copies:
         """(K, N) of maps (K, side, side) at the cells."""
         places = self.matrices @ np.stack([self.cols, self.rows, np.ones(len(self.rows))])
         col, row = np.rint(places).astype(np.intp).clip(0, self.side - 1).swapaxes(0, 1)
-        return maps[np.arange(len(maps))[:, None], row, col]
+        values: npt.NDArray[np.float32] = maps[np.arange(len(maps))[:, None], row, col]
+        return values
