@@ -25,8 +25,6 @@ def encode(height_m: npt.NDArray[np.float32], color: npt.NDArray[np.uint8]) -> n
     planes = np.empty((*height_m.shape[:-2], CHANNELS, *height_m.shape[-2:]), np.float32)
     planes[..., 0, :, :] = np.where(holes, 0, np.clip(height_m, 0, None)) / _HEIGHT_SCALE_M
     planes[..., 1, :, :] = ~holes
-    unseen = ~color.any(axis=-1)
-    planes[..., 2:, :, :] = np.where(
-        unseen[..., None, :, :], np.float32(0), np.moveaxis(color, -1, -3) * np.float32(1 / 127.5) - 1
-    )
+    seen = np.any(color, axis=-1, keepdims=True)
+    planes[..., 2:, :, :] = np.moveaxis(np.where(seen, color * np.float32(1 / 127.5) - 1, np.float32(0)), -1, -3)
     return planes

@@ -52,7 +52,11 @@ class Attempts(NamedTuple):
 
     def take(self, rows: npt.NDArray[np.int64]) -> Attempts:
         """Some of them."""
-        return Attempts(*(column[rows] for column in self))
+        return Attempts._make(column[rows] for column in self)
+
+    def append(self, others: Attempts) -> Attempts:
+        """These and then the others."""
+        return Attempts._make(np.concatenate([self[i], others[i]]) for i in range(len(self)))
 
 
 class Replay:
@@ -70,7 +74,7 @@ class Replay:
         self._alpha = alpha
         self._shards: deque[Shard] = deque()
         self._first = 0
-        self.attempts = Attempts(*(np.empty(0, kind) for kind in (*("i8",) * 8, "f4", "?")))  # type: ignore[arg-type]
+        self.attempts = Attempts._make(np.empty(0, kind) for kind in (*("i8",) * 8, "f4", "?"))
         # (error + least)^alpha of every attempt.
         self._priority: npt.NDArray[np.float64] = np.empty(0)
         # What can be reached after every attempt, 0 where nothing can; and the round in which that was found, -1: not.
@@ -88,7 +92,7 @@ class Replay:
             self._shards.append(shard)
             new = self._attempts(shard, number)
             top = self._priority.max(initial=1.0)
-            self.attempts = Attempts(*(np.concatenate(pair) for pair in zip(self.attempts, new, strict=True)))
+            self.attempts = self.attempts.append(new)
             self._priority = np.append(self._priority, np.full(len(new.row), top))
             self.value = np.append(self.value, np.zeros(len(new.row), np.float32))
             self.valued = np.append(self.valued, np.full(len(new.row), -1))
@@ -142,11 +146,16 @@ class Replay:
         self._priority = values.astype(np.float64)
 
     def _attempts(self, shard: Shard, number: int) -> Attempts:
-        integers = (shard.state, shard.next_state, shard.primitive, shard.row, shard.col, shard.rotation, shard.target)
         kept_out = np.array([held_out(int(seed)) for seed in shard.scene], np.bool_)
         return Attempts(
-            np.full(len(shard.state), number, np.int64),
-            *(column.astype(np.int64) for column in integers),
+            shard=np.full(len(shard.state), number, np.int64),
+            state=shard.state.astype(np.int64),
+            next_state=shard.next_state.astype(np.int64),
+            primitive=shard.primitive.astype(np.int64),
+            row=shard.row.astype(np.int64),
+            col=shard.col.astype(np.int64),
+            rotation=shard.rotation.astype(np.int64),
+            target=shard.target.astype(np.int64),
             reward=shard.reward[:, self._column].astype(np.float32),
             held_out=kept_out[shard.state],
         )
