@@ -11,7 +11,9 @@ from robotcell.errors import ConfigError
 
 
 def test_maps_that_say_something_pass():
-    check_maps(np.random.default_rng(0).random((8, 4, 4), np.float32), "grasp")
+    maps = np.random.default_rng(0).random((8, 4, 4), np.float32)
+    maps[:, 0, 0] = np.nan  # nobody asked
+    check_maps(maps, np.arange(16).reshape(4, 4) > 0, "grasp")
 
 
 @pytest.mark.parametrize(
@@ -26,7 +28,17 @@ def test_maps_that_say_something_pass():
 )
 def test_maps_that_say_nothing_are_refused(maps, problem):
     with pytest.raises(ConfigError, match=f"push maps .*{problem}"):
-        check_maps(maps, "push")
+        check_maps(maps, np.ones(maps.shape[1:], np.bool_), "push")
+
+
+def test_maps_that_say_nothing_inside_the_mask_are_refused():
+    maps = np.random.default_rng(0).random((8, 4, 4), np.float32)
+    inside = np.arange(16).reshape(4, 4) > 11
+    maps[:, inside] = 0.5
+    with pytest.raises(ConfigError, match="grasp maps are flat"):
+        check_maps(maps, inside, "grasp")
+    with pytest.raises(ConfigError, match=r"grasp maps are empty.* with 0 cells asked for"):
+        check_maps(maps, np.zeros((4, 4), np.bool_), "grasp")
 
 
 @given(
