@@ -180,12 +180,16 @@ def _serve(connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Leaves the `with` blocks of the task.
     signal.signal(signal.SIGTERM, _leave)
-    while True:
-        try:
-            message = connection.recv_bytes()
-        except (EOFError, OSError):
-            return
-        connection.send_bytes(_do(message))
+    try:
+        while True:
+            try:
+                message = connection.recv_bytes()
+            except (EOFError, OSError):
+                return
+            connection.send_bytes(_do(message))
+    finally:
+        # No block is left to leave: an exception would only disturb what libraries do when the interpreter ends.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def _do(message: bytes) -> bytes:

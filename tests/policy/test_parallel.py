@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import socket
@@ -67,6 +68,12 @@ def leave_a_mark_at_the_end(folder: Path) -> None:
         (folder / f"{os.getpid()}-left").touch()
 
 
+def be_told_to_end_twice(_: int) -> None:
+    """The second time while the interpreter ends."""
+    atexit.register(os.kill, os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 @pytest.mark.parametrize("workers", [None, 1, 2])
 def test_every_task_gets_its_result_under_its_number(workers: int | None) -> None:
     assert dict(run_tasks(square, range(2, 7), workers)) == {0: 4, 1: 9, 2: 16, 3: 25, 4: 36}
@@ -95,6 +102,12 @@ def test_workers_are_other_processes_with_one_thread_each() -> None:
 def test_a_worker_that_dies_is_an_error_that_says_so() -> None:
     with pytest.raises(CellError, match="task 1 was killed by SIGKILL"):
         list(run_tasks(die, range(4), 2))
+
+
+def test_a_worker_that_is_leaving_already_leaves_in_silence(capfd: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(CellError, match="task 0 was killed by SIGTERM"):
+        list(run_tasks(be_told_to_end_twice, [0], 2))
+    assert capfd.readouterr().err == ""
 
 
 def interrupted_once_begun(folder: Path, tasks: int) -> Iterator[Path]:
