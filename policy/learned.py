@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.encoding import encode
-from policy.inference import GRASP, PUSH
+from policy.network import GRASP, PUSH
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
 from policy.selection import best_cells, check_maps, push_mask, pushes, surface_at

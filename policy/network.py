@@ -18,6 +18,8 @@ from robotcell.decision import ROTATIONS
 if TYPE_CHECKING:
     from torch import Tensor
 
+# Channels of the Q maps.
+GRASP, PUSH = 0, 1
 # The jaw is symmetric: half a turn changes nothing.
 GRASP_ROTATIONS = ROTATIONS // 2
 PUSH_ROTATIONS = ROTATIONS

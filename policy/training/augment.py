@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.encoding import encode
+from policy.network import GRASP
 from policy.rotation import turn_matrix
-from policy.training.shard import GRASP, unpack_height
+from policy.training.shard import unpack_height
 from robotcell.decision import ROTATIONS
 
 if TYPE_CHECKING:

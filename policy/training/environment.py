@@ -17,10 +17,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from policy.encoding import CHANNELS, encode
+from policy.network import GRASP, PUSH
 from policy.push_line import PushLine, free_to_descend, push_line
 from policy.selection import surface_at
 from policy.training.scenes import training_scene
-from policy.training.shard import GRASP, PUSH
 from robotcell.config import CameraMount, CellConfig
 from robotcell.decision import ROTATIONS
 from robotcell.errors import ConfigError

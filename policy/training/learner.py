@@ -14,11 +14,11 @@ from scipy.stats import rankdata
 from torch.nn import functional
 
 from policy.encoding import encode
-from policy.network import GRASP_ROTATIONS
+from policy.network import GRASP, GRASP_ROTATIONS, PUSH
 from policy.precision import autocast
 from policy.rotation import MARGINS, Copies
 from policy.training.augment import crop
-from policy.training.shard import GRASP, PUSH, unpack_height
+from policy.training.shard import unpack_height
 
 if TYPE_CHECKING:
     from collections.abc import Callable

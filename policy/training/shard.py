@@ -11,8 +11,6 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from pathlib import Path
 
-GRASP, PUSH = 0, 1
-
 # Heights are kept as tenths of a millimetre above the lower end of the heightmap's band; 0 = never seen.
 _LOWEST_M = -0.10
 _UNIT_M = 1e-4
@@ -29,7 +27,7 @@ class Shard:
             same number in all states of its scene.
         scene: (S,) int32 seed of the scene that the state belongs to.
         state: (N,) int32 state in which the attempt was made.
-        primitive: (N,) int8, `GRASP` or `PUSH`.
+        primitive: (N,) int8, `policy.network.GRASP` or `PUSH`.
         row, col: (N,) int16 cell of the Q map.
         rotation: (N,) int8 plane of the Q map, 0..7 for a grasp and 0..15 for a push.
         target: (N,) int16 object that the cell belongs to; the rewards of stage II are those of this object as goal.
