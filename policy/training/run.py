@@ -69,7 +69,7 @@ def train(
         workers: that play scenes; see `policy.parallel.run_tasks`.
         ray_address: of a Ray cluster that sees the folder of the run under the same path.
         collect: plays the scenes of a task.
-        on_progress: told while a round collects and learns.
+        on_progress: told while a round collects, looks ahead and learns.
         on_round: given the metrics of each round as it ends.
 
     Returns:
@@ -193,13 +193,12 @@ def _train(
         start = time.perf_counter()
         shards, collected = _collect(config, stage, round_, folder, collect, workers, ray_address, on_progress)
         replay.extend(shards)
-        if not len(replay):
+        if replay.attempts.held_out.all():
             raise ConfigError(
                 f"{folder / 'shards'}: the scenes of round {round_} gave nothing to learn from; set a larger "
                 "scenes_per_round, collect.grasps or collect.pushes, and train into another --run folder"
             )
-        learner.look_ahead(replay, round_, partial(on_progress, "look ahead"))
-        learned = _learn(learner, replay, plan.updates_per_round * (round_ + 1), on_progress)
+        learned = _learn(learner, replay, round_, plan.updates_per_round * (round_ + 1), on_progress)
         metrics: Metrics = {
             "stage": stage,
             "round": round_,
@@ -293,9 +292,10 @@ def _part(values: np.typing.NDArray[np.bool_]) -> float:
     return float(values.mean()) if len(values) else math.nan
 
 
-def _learn(learner: Learner, replay: Replay, until: int, on_progress: Progress) -> Metrics:
-    """Update until so many updates of the stage are done."""
+def _learn(learner: Learner, replay: Replay, round_: int, until: int, on_progress: Progress) -> Metrics:
+    """Look ahead, and update until so many updates of the stage are done."""
     start = time.perf_counter()
+    learner.look_ahead(replay, round_, partial(on_progress, "look ahead"))
     rate = learner.learning_rate
     first = learner.updates
     losses = []
