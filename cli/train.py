@@ -73,7 +73,7 @@ def _train(
 
         def follow(what: str, done: int, total: int) -> None:
             if bars.tasks[0].description != what:
-                bars.reset(bar, description=what)
+                bars.reset(bar, description=what, total=total)
             bars.update(bar, completed=done, total=total)
 
         def tell(metrics: dict[str, float]) -> None:
