@@ -23,8 +23,8 @@ grasps = 2
 pushes = 1
 states = 1
 [learning]
-batch = 2
-crop_cells = 64
+grasps = 2
+pushes = 2
 [stage1]
 rounds = 1
 scenes_per_round = 2

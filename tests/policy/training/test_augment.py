@@ -3,154 +3,147 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.training.augment import augment, transform
-from policy.training.replay import Sample, View
-from policy.training.shard import GRASP, PUSH
+from policy.encoding import encode
+from policy.rotation import Copies
+from policy.training.augment import CROP_CELLS, crop
+from policy.training.replay import View
+from policy.training.shard import GRASP, PUSH, unpack_height
 
-SIZE = 64
-MIDDLE = ((SIZE - 1) / 2, (SIZE - 1) / 2)
-STEPS = st.integers(0, 15)
+SIZE = 80
+MIDDLE = CROP_CELLS // 2
+
+ROTATIONS = st.integers(0, 15)
+PRIMITIVES = st.sampled_from([GRASP, PUSH])
+CELLS = st.tuples(st.integers(0, SIZE - 1), st.integers(0, SIZE - 1))
+SEEDS = st.integers(0, 2**32 - 1)
 
 
-def make_view(*spots: tuple[float, float]) -> View:
-    """Spots (row, col) of 5 x 5 cells, labelled from 1."""
+def noise() -> View:
+    """No two cells are alike."""
+    rng = np.random.default_rng(0)
+    height = rng.integers(1000, 3000, (SIZE, SIZE)).astype(np.uint16)
+    return View(height, rng.integers(1, 256, (SIZE, SIZE, 3), np.uint8), np.ones((SIZE, SIZE), np.uint8))
+
+
+def spots(*places: tuple[float, float]) -> View:
+    """A table with blocks of 5 x 5 cells and 5 cm around (row, col)."""
     labels = np.zeros((SIZE, SIZE), np.uint8)
-    for label, (row, col) in enumerate(spots, 1):
+    for label, (row, col) in enumerate(places, 1):
         r, c = round(row), round(col)
         labels[r - 2 : r + 3, c - 2 : c + 3] = label
-    height = np.where(labels > 0, 1500, 1000).astype(np.uint16)
-    return View(height, np.repeat(labels[:, :, None] * 40, 3, axis=2), labels)
+    height = np.where(labels > 0, 1501, 1001).astype(np.uint16)
+    return View(height, np.full((SIZE, SIZE, 3), 100, np.uint8), labels)
 
 
-def make_sample(
-    primitive: int, cell: tuple[int, int], rotation: int, view: View, after: tuple[View, ...] = (), target: int = 1
-) -> Sample:
-    return Sample(
-        view=view,
-        primitive=np.array([primitive], np.int8),
-        row=np.array([cell[0]], np.int16),
-        col=np.array([cell[1]], np.int16),
-        rotation=np.array([rotation], np.int8),
-        target=np.array([target], np.int16),
-        reward=np.array([1], np.float32),
-        following=np.array([0 if after else -1]),
-        views_after=after,
-    )
+def turn(view: View, quarters: int) -> View:
+    """From +x (columns) to +y (rows)."""
+    return View(*(np.rot90(plane, -quarters) for plane in view))
 
 
-def middle_of(labels: np.typing.NDArray[np.uint8], label: int) -> tuple[float, float]:
-    rows, cols = np.nonzero(labels == label)
+def turned_cell(cell: tuple[int, int], quarters: int) -> tuple[int, int]:
+    row, col = cell
+    for _ in range(quarters % 4):
+        row, col = col, SIZE - 1 - row
+    return row, col
+
+
+def center_of(block: np.typing.NDArray[np.bool_]) -> tuple[float, float]:
+    rows, cols = np.nonzero(block)
     return float(rows.mean()), float(cols.mean())
 
 
-@given(st.sampled_from([GRASP, PUSH]), st.integers(0, 15), STEPS, st.booleans(), st.integers(24, 40))
-def test_an_attempt_keeps_its_place_and_direction_in_the_picture(
-    primitive: int, rotation: int, steps: int, mirrored: bool, row: int
+@given(PRIMITIVES, CELLS, ROTATIONS, st.integers(1, 3))
+def test_a_turned_scene_and_a_turned_action_give_the_same_crop(
+    primitive: int, cell: tuple[int, int], rotation: int, quarters: int
 ) -> None:
-    rotation %= 8 if primitive == GRASP else 16
+    view = noise()
+    one = crop(view, primitive, cell, rotation, None)
+    two = crop(turn(view, quarters), primitive, turned_cell(cell, quarters), rotation + 4 * quarters, None)
+    assert one.shape == (5, CROP_CELLS, CROP_CELLS)
+    # A cell halfway between two may be seen as either.
+    assert (one != two).any(axis=0).mean() < 0.01
+    np.testing.assert_array_equal(one[:, MIDDLE, MIDDLE], two[:, MIDDLE, MIDDLE])
+
+
+@given(PRIMITIVES, CELLS, ROTATIONS)
+def test_the_network_learns_from_what_it_is_shown_at_work(primitive: int, cell: tuple[int, int], rotation: int) -> None:
+    view = noise()
+    mask = np.zeros((SIZE, SIZE), np.bool_)
+    mask[cell] = True
+    copies = Copies.around(mask, range(rotation, rotation + 1), MIDDLE)
+    shown = copies.turn(encode(unpack_height(view.height), view.color))[0]
+    np.testing.assert_array_equal(crop(view, primitive, cell, rotation, None), shown)
+
+
+@given(ROTATIONS, st.integers(30, 50), st.integers(30, 50))
+def test_an_attempt_runs_along_plus_x(rotation: int, row: int, col: int) -> None:
     angle = math.tau * rotation / 16
-    # Rows run along base y and columns along base x: the direction of plane k is (cos, sin) in (column, row).
-    ahead = (row + 14 * math.sin(angle), 30 + 14 * math.cos(angle))
-    view = make_view((row, 30), ahead)
-    turned = transform(
-        make_sample(primitive, (row, 30), rotation, view), steps, mirrored=mirrored, center=MIDDLE, size=SIZE
-    )
-    assert turned.view.labels[turned.row[0], turned.col[0]] == 1
-    first, second = middle_of(turned.view.labels, 1), middle_of(turned.view.labels, 2)
-    seen = math.atan2(second[0] - first[0], second[1] - first[1])
-    told = math.tau * int(turned.rotation[0]) / 16
-    period = math.pi if primitive == GRASP else math.tau
-    difference = (seen - told + period / 2) % period - period / 2
-    assert abs(difference) < math.radians(8)
+    # Rows run along base y and columns along base x.
+    view = spots((row + 15 * math.sin(angle), col + 15 * math.cos(angle)))
+    seen = crop(view, PUSH, (row, col), rotation, None)
+    assert center_of(seen[0] > 0.5) == pytest.approx((MIDDLE, MIDDLE + 15), abs=1.0)
 
 
-@given(STEPS, st.booleans())
-def test_what_follows_is_transformed_alike(steps: int, mirrored: bool) -> None:
-    view = make_view((30, 20), (40, 44))
-    turned = transform(
-        make_sample(PUSH, (30, 20), 3, view, (view,)), steps, mirrored=mirrored, center=(25, 35), size=48
-    )
-    for name in ("height", "color", "labels"):
-        np.testing.assert_array_equal(getattr(turned.view, name), getattr(turned.views_after[0], name))
-    assert turned.view.height.shape == (48, 48)
+def test_what_was_not_seen_and_what_is_beyond_the_map_is_0() -> None:
+    view = noise()
+    view.height[40:44, 40:44] = 0
+    view.color[40:44, 40:44] = 0
+    for rng in (None, np.random.default_rng(0)):
+        seen = crop(view, PUSH, (10, 40), 3, rng)
+        assert set(np.unique(seen[1])) == {0.0, 1.0}
+        assert not seen[:, seen[1] == 0].any()
+        assert 0.2 < seen[1].mean() < 0.6
 
 
-def test_a_quarter_turn_moves_x_to_y() -> None:
-    view = make_view((10, 20), (40, 44))
-    turned = transform(make_sample(PUSH, (10, 20), 0, view), 4, mirrored=False, center=MIDDLE, size=SIZE)
-    np.testing.assert_array_equal(turned.view.labels, np.rot90(view.labels, -1))
-    assert (turned.row[0], turned.col[0], turned.rotation[0]) == (20, SIZE - 1 - 10, 4)
+@given(SEEDS)
+def test_variations_keep_the_attempt_in_place(seed: int) -> None:
+    """The block ahead stays ahead, within a few degrees and cells."""
+    angle = math.tau * 3 / 16
+    view = spots((40 + 20 * math.sin(angle), 40 + 20 * math.cos(angle)))
+    seen = crop(view, PUSH, (40, 40), 3, np.random.default_rng(seed))
+    row, col = center_of(seen[0] > 0.5)
+    assert abs(row - MIDDLE) < 8
+    assert abs(col - MIDDLE - 20) < 5
 
 
-def test_a_mirror_image_turns_rows_and_directions_over() -> None:
-    view = make_view((10, 20), (40, 44))
-    turned = transform(make_sample(PUSH, (10, 20), 3, view), 0, mirrored=True, center=MIDDLE, size=SIZE)
-    np.testing.assert_array_equal(turned.view.labels, view.labels[::-1])
-    assert (turned.row[0], turned.col[0], turned.rotation[0]) == (SIZE - 1 - 10, 20, 13)
+@given(SEEDS)
+def test_the_table_is_a_little_higher_or_lower_everywhere(seed: int) -> None:
+    seen = crop(spots((40, 40)), PUSH, (40, 40), 3, np.random.default_rng(seed))
+    # In units of 5 cm; the table is not below itself.
+    assert abs(seen[0, seen[0] > 0.5] - 1).max() < 0.1
+    assert seen[0].min() >= 0
 
 
-@given(STEPS, st.booleans())
-def test_nothing_changes_for_a_transformation_and_its_inverse(steps: int, mirrored: bool) -> None:
-    sample = make_sample(GRASP, (30, 40), 5, make_view((30, 40)))
-    there = transform(sample, steps, mirrored=mirrored, center=MIDDLE, size=SIZE)
-    # A mirror image is its own inverse, rotated or not.
-    back = transform(there, steps if mirrored else -steps, mirrored=mirrored, center=MIDDLE, size=SIZE)
-    assert back.rotation[0] == 5
-    assert abs(int(back.row[0]) - 30) <= 1
-    assert abs(int(back.col[0]) - 40) <= 1
-
-
-def test_cells_from_outside_are_unknown_and_attempts_outside_are_dropped() -> None:
-    sample = make_sample(GRASP, (2, 2), 0, make_view((2, 2)))
-    turned = transform(sample, 2, mirrored=False, center=MIDDLE, size=SIZE)
-    assert turned.view.height[0, 0] == 0
-    assert turned.view.color[0, 0].tolist() == [0, 0, 0]
-    assert turned.view.labels[0, 0] == 0
-    assert len(turned.row) == len(turned.reward) == len(turned.following) == 0
-
-
-def test_a_push_whose_target_leaves_the_square_is_dropped() -> None:
-    before, gone = make_view((32, 32)), make_view((32, 60))
-    cut = {"steps": 0, "mirrored": False, "center": (32.0, 32.0), "size": 32}
-    assert len(transform(make_sample(PUSH, (32, 32), 0, before, (gone,)), **cut).reward) == 0  # type: ignore[arg-type]
-    # A target that is not there at all is a fact to learn from.
-    missing = make_view()
-    assert len(transform(make_sample(PUSH, (32, 32), 0, before, (missing,)), **cut).reward) == 1  # type: ignore[arg-type]
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_light_and_height_change_alike_before_and_after(seed: int) -> None:
-    view = make_view((30, 30), (36, 40))
-    view.height[:5] = 0
-    changed = augment(make_sample(PUSH, (30, 30), 3, view, (view,)), 48, np.random.default_rng(seed))
-    after = changed.views_after[0]
-    np.testing.assert_array_equal(changed.view.color, after.color)
-    np.testing.assert_array_equal(changed.view.height, after.height)
-    known = changed.view.height[changed.view.height > 0].astype(int)
-    tops, floor = known[known > 1250], known[known <= 1250]
-    assert abs(floor - 1000).max() <= 10
-    assert len(set(floor)) == 1
-    assert len(set(tops)) <= 1
-    assert changed.view.labels[changed.row[0], changed.col[0]] == 1
-
-
-def test_every_attempt_is_seen_at_times() -> None:
-    """However far from the others: a corner of the map would otherwise never be learned."""
-    far = make_sample(GRASP, (3, 3), 0, make_view((3, 3)))
-    many = Sample(
-        view=far.view,
-        primitive=np.zeros(6, np.int8),
-        row=np.array([3, 55, 56, 57, 58, 59], np.int16),
-        col=np.array([3, 55, 56, 57, 58, 59], np.int16),
-        rotation=np.zeros(6, np.int8),
-        target=np.arange(6, dtype=np.int16),
-        reward=np.zeros(6, np.float32),
-        following=np.full(6, -1),
-        views_after=(),
-    )
+def ahead(primitive: int) -> list[tuple[float, float]]:
+    """Where variations put a block that lies ahead and to the right."""
+    view = spots((44, 55))
     rng = np.random.default_rng(0)
-    seen = np.bincount(np.concatenate([augment(many, 46, rng).target for _ in range(400)]), minlength=6)
-    assert seen.min() > 5
+    return [center_of(crop(view, primitive, (40, 40), 0, rng)[0] > 0.5) for _ in range(200)]
+
+
+def test_a_grasp_is_seen_from_both_sides_and_a_push_from_one() -> None:
+    assert 60 < sum(col > MIDDLE for _, col in ahead(GRASP)) < 140
+    assert all(col > MIDDLE for _, col in ahead(PUSH))
+
+
+def test_half_of_the_crops_are_mirror_images() -> None:
+    assert 60 < sum(row > MIDDLE for row, _ in ahead(PUSH)) < 140
+
+
+def test_light_and_colours_vary() -> None:
+    rng = np.random.default_rng(0)
+    view = spots((40, 40))
+    tints = np.array([crop(view, PUSH, (40, 40), 0, rng)[2:, MIDDLE, MIDDLE] for _ in range(100)])
+    # Brightness 0.7 to 1.3, and its balance 0.85 to 1.15, of 100 / 127.5 - 1.
+    assert tints.min() == pytest.approx(100 * 0.7 * 0.85 / 127.5 - 1, abs=0.1)
+    assert tints.max() == pytest.approx(100 * 1.3 * 1.15 / 127.5 - 1, abs=0.1)
+    assert np.abs(tints[:, 0] - tints[:, 1]).mean() > 0.02
+
+
+def test_variations_can_be_repeated() -> None:
+    one, two = (crop(noise(), GRASP, (40, 40), 5, np.random.default_rng(7)) for _ in range(2))
+    np.testing.assert_array_equal(one, two)

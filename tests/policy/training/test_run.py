@@ -29,7 +29,7 @@ STAGE = StageSettings(
 CONFIG = TrainConfig(
     scenes_per_task=2,
     collect=CollectSettings(grasps=6, pushes=3),
-    learning=LearningSettings(batch=2, target_sync=4, capacity_states=30),
+    learning=LearningSettings(grasps=2, pushes=2, values_per_round=5, capacity_states=30),
     stage1=STAGE,
     stage2=STAGE.model_copy(update={"rounds": 1, "warmup_rounds": 0}),
 )
@@ -46,7 +46,7 @@ from tests.policy.training import toy
 torch.set_num_threads(1)
 def say(what, done, total):
     print(what, done, total, flush=True)
-    time.sleep(0.1)
+    time.sleep(0.01 if what == "look ahead" else 0.1)
 run = Path(sys.argv[1])
 train(load_train_config(run / "stage1" / "train.toml"), 1, run, workers=1, collect=toy.collect, on_progress=say)
 """
@@ -97,8 +97,10 @@ def assert_same(run: Path, other: Path) -> None:
     assert str(told[0]) == str(told[1])
     one, two = (load_checkpoint(folder / "stage1" / "checkpoint.pt") for folder in (run, other))
     assert (one["rounds"], one["updates"]) == (two["rounds"], two["updates"]) == (3, 15)
-    assert torch.equal(one["priorities"], two["priorities"])
-    assert all(torch.equal(tensor, two["online"][name]) for name, tensor in one["online"].items())
+    for name in ("priorities", "value", "valued"):
+        assert torch.equal(one[name], two[name])
+    for name in ("online", "target"):
+        assert all(torch.equal(tensor, two[name][key]) for key, tensor in one[name].items())
 
 
 def test_a_run_leaves_everything_in_its_folder(trained: Path) -> None:
@@ -120,8 +122,8 @@ def test_a_run_leaves_everything_in_its_folder(trained: Path) -> None:
     assert [line["updates"] for line in metrics] == [5, 10, 15]
     # Nothing was greedy before there were weights.
     assert [line["greedy_grasps"] for line in metrics] == [0, 72, 72]
-    # 12 states a round, 2 of them held out in the first and the third; never more than 30 in memory.
-    assert [line["replay"] for line in metrics] == [10, 22, 26]
+    # 12 states of 9 attempts a round; never more than 30 states in memory, in shards of 4.
+    assert [line["replay"] for line in metrics] == [108, 216, 252]
     assert (trained / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -131,6 +133,16 @@ def test_the_weights_say_how_they_came_about(trained: Path) -> None:
     assert (card["stage"], card["updates"]) == ("1", "15")
     saved = load_checkpoint(trained / "stage1" / "checkpoint.pt")["online"]
     assert all(torch.equal(tensor, saved[name]) for name, tensor in network.state_dict().items())
+
+
+def test_what_follows_a_push_is_found_in_every_round(trained: Path) -> None:
+    state = load_checkpoint(trained / "stage1" / "checkpoint.pt")
+    # The oldest shard in memory is one of round 0.
+    assert set(state["valued"].tolist()) == {-1, 0, 1, 2}
+    assert state["value"][state["valued"] >= 0].any()
+    assert not state["value"][state["valued"] < 0].any()
+    # The network that values them is that of the round before.
+    assert not all(torch.equal(tensor, state["target"][name]) for name, tensor in state["online"].items())
 
 
 def kill_when(run: Path, said: Callable[[str], bool]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import cv2
@@ -13,14 +12,15 @@ from policy.training.shard import GRASP, PUSH, Shard, pack_height
 if TYPE_CHECKING:
     from policy.training.collect import Collection
 
-SIZE = 32
+SIZE = 64
 _HEIGHT_M = 0.05
+_LENGTH, _WIDTH = 26.0, 8.0
 
 
 def collect(collection: Collection) -> Shard:
     """Two states of each scene; a push leads from the first to the second.
 
-    A grasp succeeds near the middle of its bar, across it. A push is rewarded along its bar.
+    A grasp succeeds across its bar. A push is rewarded along its bar.
     """
     rng = np.random.default_rng([collection.stage, *collection.seeds])
     states = [(seed, _bars(rng)) for seed in collection.seeds for _ in range(2)]
@@ -33,10 +33,9 @@ def collect(collection: Collection) -> Shard:
             for row, col in cells[rng.integers(len(cells), size=count)]:
                 target = int(labels[row, col])
                 plane = int(rng.integers(8 if primitive == GRASP else 16))
-                x, y, along = bars[target - 1]
-                across = (plane - along) % 8 in (3, 4, 5)
+                *_, along = bars[target - 1]
                 if primitive == GRASP:
-                    reward = float(across and math.hypot(col - x, row - y) < 4)
+                    reward = float((plane - along) % 8 in (3, 4, 5))
                 else:
                     reward = 0.5 * float((plane - along) % 8 in (7, 0, 1))
                 after = state + 1 if primitive == PUSH and state % 2 == 0 else -1
@@ -62,7 +61,7 @@ def collect(collection: Collection) -> Shard:
 
 def _bars(rng: np.random.Generator) -> list[tuple[float, float, int]]:
     """(x, y, direction in steps of 22.5 degrees) of each bar; they do not touch."""
-    return [(float(x), float(rng.integers(10, SIZE - 10)), int(rng.integers(8))) for x in (8, SIZE - 9)]
+    return [(float(x), float(rng.integers(20, SIZE - 20)), int(rng.integers(8))) for x in (16, SIZE - 17)]
 
 
 def _draw(
@@ -70,8 +69,8 @@ def _draw(
 ) -> tuple[np.typing.NDArray[np.uint16], np.typing.NDArray[np.uint8], np.typing.NDArray[np.uint8]]:
     labels = np.zeros((SIZE, SIZE), np.uint8)
     for number, (x, y, along) in enumerate(bars, 1):
-        corners = cv2.boxPoints(((x, y), (13.0, 4.0), 22.5 * along))
+        corners = cv2.boxPoints(((x, y), (_LENGTH, _WIDTH), 22.5 * along))
         cv2.fillPoly(labels, [np.rint(corners).astype(np.int32)], number)
     height = np.where(labels > 0, _HEIGHT_M, 0).astype(np.float32)
-    color = rng.integers(0, 256, (SIZE, SIZE, 3), np.uint8)
+    color = rng.integers(1, 256, (len(bars) + 1, 3), np.uint8)[labels]
     return pack_height(height), color, labels
