@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from policy.network import GRASP, PUSH
 from policy.networks import make_network
 from policy.parallel import run_tasks
 from policy.training import collect as playing
@@ -31,7 +32,7 @@ from policy.training.config import load_train_config, save_train_config, single_
 from policy.training.curves import draw_curves
 from policy.training.learner import Learner
 from policy.training.replay import Replay
-from policy.training.shard import GRASP, PUSH, Shard
+from policy.training.shard import Shard
 from policy.weights import save_weights
 from robotcell.errors import ConfigError
 

@@ -11,8 +11,8 @@ from torch import nn
 
 from policy import inference
 from policy.encoding import encode
-from policy.inference import GRASP, PUSH, Inference
-from policy.network import QNetwork
+from policy.inference import Inference, fuse_norms
+from policy.network import GRASP, PUSH, QNetwork
 from policy.weights import save_weights
 
 SIZE = 72
@@ -126,3 +126,17 @@ def test_the_network_comes_from_a_file(network, asked, tmp_path):
     planes, objects = scene()
     loaded = Inference.load(tmp_path / "some.safetensors")
     np.testing.assert_array_equal(loaded.maps(planes, objects, GRASP), asked.maps(planes, objects, GRASP))
+
+
+def test_norms_that_are_fused_change_no_value():
+    torch.manual_seed(3)
+    network = QNetwork().train()
+    x = torch.rand(2, 5, 32, 32)
+    network(x)  # fills the norms' statistics
+    network.eval()
+    with torch.no_grad():
+        before = network(x)
+        fuse_norms(network)
+        after = network(x)
+    assert sum(isinstance(part, torch.nn.BatchNorm2d) for part in network.modules()) == 0
+    assert torch.allclose(before, after, atol=1e-5)

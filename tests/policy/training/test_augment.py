@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from policy.encoding import encode
+from policy.network import GRASP, PUSH
 from policy.rotation import Copies
 from policy.training.augment import CROP_CELLS, crop
 from policy.training.replay import View
-from policy.training.shard import GRASP, PUSH, unpack_height
+from policy.training.shard import unpack_height
 
 SIZE = 80
 MIDDLE = CROP_CELLS // 2

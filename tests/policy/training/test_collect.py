@@ -5,9 +5,10 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from policy.network import GRASP, PUSH
 from policy.training.collect import Collection, collect
 from policy.training.config import CollectSettings
-from policy.training.shard import GRASP, PUSH, Shard, pack_height, unpack_height
+from policy.training.shard import Shard, pack_height, unpack_height
 
 SEEDS = (1_500_001, 1_500_002)
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 from torch import nn
 
-from policy.network import QNetwork
+from policy.network import GRASP, PUSH, QNetwork
 from policy.training import augment
 from policy.training.collect import Collection
 from policy.training.config import CollectSettings, LearningSettings
 from policy.training.learner import Learner, auc, double_q
 from policy.training.replay import Replay, View
-from policy.training.shard import GRASP, PUSH, Shard
+from policy.training.shard import Shard
 from tests.policy.training import toy
 
 if TYPE_CHECKING:

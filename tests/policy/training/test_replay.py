@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from policy.network import GRASP, PUSH
 from policy.training.config import held_out
 from policy.training.replay import Replay
-from policy.training.shard import GRASP, PUSH, Shard
+from policy.training.shard import Shard
 
 TRAINING, VALIDATION = 1, 16
 # Of an attempt without error.

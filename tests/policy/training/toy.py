@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from policy.training.shard import GRASP, PUSH, Shard, pack_height
+from policy.network import GRASP, PUSH
+from policy.training.shard import Shard, pack_height
 
 if TYPE_CHECKING:
     from policy.training.collect import Collection
