@@ -15,12 +15,13 @@ import torch
 from policy import make_policy
 from policy.encoding import encode
 from policy.inference import Inference
+from policy.network import GRASP, PUSH
 from policy.networks import make_network
 from policy.weights import load_named
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.decision import Observation
-from robotcell.heightmap import build_heightmap
+from robotcell.heightmap import build_heightmap, close_gaps
 from robotcell.perception import find_goal, segment
 
 OBJECTS = 30
@@ -65,13 +66,13 @@ def frame_to_action(config, frame, policy):
 
 
 def test_encode(benchmark, heightmap):
-    assert benchmark(encode, heightmap.height_m, heightmap.color).shape == (5, 224, 224)
+    assert benchmark(encode, close_gaps(heightmap.height_m), heightmap.color).shape == (5, 224, 224)
 
 
-def test_maps(benchmark, heightmap, inference):
-    grasp, push = benchmark(inference.maps, heightmap.height_m, heightmap.color)
-    assert np.isfinite(grasp).all()
-    assert np.isfinite(push).all()
+@pytest.mark.parametrize("primitive", [GRASP, PUSH], ids=["grasp", "push"])
+def test_maps(benchmark, heightmap, inference, primitive):
+    planes, goal = encode(close_gaps(heightmap.height_m), heightmap.color), observe(heightmap).goal
+    assert np.isfinite(benchmark(inference.maps, planes, goal, primitive)[:, goal]).all()
 
 
 def test_decide(benchmark, heightmap, policy):
@@ -86,10 +87,13 @@ def test_frame_to_action(benchmark, config, frame, policy):
 def test_beside_the_paper_network(benchmark, config, frame, heightmap, policy):
     """The paper's network once, ours many times, in the same process and run."""
     paper = Inference(make_network("paper"))
+    # Of so many cells, its sixteen copies are 320 x 320 cells, as in the paper.
+    cells = np.zeros(heightmap.height_m.shape, np.bool_)
+    cells[40:184, 40:184] = True
 
     def compare():
         started = time.perf_counter()
-        paper.maps(heightmap.height_m, heightmap.color)
+        paper.maps(encode(close_gaps(heightmap.height_m), heightmap.color), cells, PUSH)
         paper_s = time.perf_counter() - started
         ours = []
         for _ in range(ROUNDS):
