@@ -209,6 +209,6 @@ def test_an_empty_table_has_no_target(policy):
 
 
 def test_an_unknown_policy_lists_those_that_exist():
-    with pytest.raises(ConfigError, match="no policy is called 'oracle'; there is: heuristic"):
+    with pytest.raises(ConfigError, match="no policy is called 'oracle'; there is: grasp-only, heuristic, learned"):
         make_policy("oracle", CONFIG)
     assert make_policy("heuristic", CONFIG).name == "heuristic"
