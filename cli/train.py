@@ -55,7 +55,7 @@ def _train(
     err: Console,
 ) -> Path:
     # Read when PyTorch is loaded. Where other programs use the processor, threads that wait by spinning take it from
-    # those that work: an update takes 2.4 s instead of 0.7 s on two busy cores.
+    # those that work, and an update takes several times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         from policy.training.config import load_train_config

@@ -185,7 +185,9 @@ def _train(
     replay = Replay(stage, config.learning.capacity_states, config.learning.priority_alpha)
     played = [path for path in _shard_paths(folder) if _round_of(path) < first]
     replay.extend(_newest([*earlier, *played], config.learning.capacity_states))
-    if checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
+    if checkpoint is None and earlier:
+        _take_over_values(replay, load_checkpoint(run / "stage1" / "checkpoint.pt"))
+    elif checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
         # Somebody may have deleted a shard; then all attempts are as new.
         replay.priorities = checkpoint["priorities"].numpy()
         replay.value, replay.valued = checkpoint["value"].numpy(), checkpoint["valued"].numpy()
@@ -324,6 +326,13 @@ def _finished_stage1(run: Path, learner: Learner) -> list[Path]:
     learner.online.load_state_dict(state["online"])
     learner.target.load_state_dict(state["online"])
     return _shard_paths(run / "stage1")
+
+
+def _take_over_values(replay: Replay, stage1: dict[str, torch.Tensor]) -> None:
+    """Begin with the values that stage 1 found, as the oldest: they are of the same objects and nearly the network."""
+    if len(stage1["value"]) == len(replay):
+        replay.value = stage1["value"].numpy()
+        replay.valued = np.minimum(stage1["valued"].numpy(), 0)
 
 
 def _check_stage1(run: Path) -> dict[str, dict[str, torch.Tensor]]:

@@ -280,3 +280,21 @@ def test_a_round_that_gives_nothing_is_an_error(tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"stage1": STAGE.model_copy(update={"scenes_per_round": 1})})
     with pytest.raises(ConfigError, match="nothing to learn from"):
         run_stage(tmp_path, config=config)
+
+
+def test_stage_2_begins_with_the_values_that_stage_1_found(tmp_path: Path) -> None:
+    learning = CONFIG.learning.model_copy(update={"capacity_states": 1000})
+    config = run_stage(tmp_path, config=CONFIG.model_copy(update={"learning": learning}))
+    said: list[tuple[str, int, int]] = []
+    train(
+        prepare(2, tmp_path, config),
+        2,
+        tmp_path,
+        workers=1,
+        collect=toy.collect,
+        on_progress=lambda *at: said.append(at),
+    )
+    looked_at = {total for what, _, total in said if what == "look ahead"}
+    # Six scenes with one state that pushes lead on from, three pushes in each.
+    assert len(looked_at) == 1
+    assert max(looked_at) <= 18
