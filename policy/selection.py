@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 DILATIONS = 15
 # Cells of the push maps that are tried in the order of their value before pushing is given up.
 _PUSH_TRIES = 2000
+# What is pushed stays this far inside the workspace.
+_RIM_M = 0.02
+_OBJECT_M = 0.010
 # Maps whose values differ by less than this say nothing.
 _FLAT = 1e-6
 
@@ -72,11 +75,35 @@ def pushes(
     push_m: float,
     resolution_m: float,
 ) -> Iterator[tuple[int, float, PushLine]]:
-    """Pushes through cells of a mask that have a place to begin, the most valuable first: rotation, Q, line."""
+    """Pushes through cells of a mask that have a place to begin: rotation, Q, line.
+
+    The most valuable first of those that leave what they push in the workspace; then of the others.
+    """
+    others = []
     for k, row, col, value in best_cells(q, mask, _PUSH_TRIES):
         line = push_line(height_m, free, (row, col), k, push_m, resolution_m)
-        if line is not None:
+        if line is None:
+            continue
+        if _stays_inside(line, height_m, resolution_m):
             yield k, value, line
+        else:
+            others.append((k, value, line))
+    yield from others
+
+
+def _stays_inside(line: PushLine, height_m: npt.NDArray[np.float32], resolution_m: float) -> bool:
+    """Whether what stands in the way of a push would still be in the workspace at its end.
+
+    All that stands on the line, also beyond its end, is taken to be swept together in front of the fingers.
+    """
+    first, last = line.cells[0], line.cells[-1]
+    length = max(1, len(line.cells) - 1)
+    steps = np.arange(max(height_m.shape) * 2)
+    ray = np.rint(first + (last - first) / length * steps[:, None]).astype(np.intp)
+    inside = ((ray >= 0) & (ray < height_m.shape)).all(axis=1)
+    ray = ray[: int(inside.argmin())] if not inside.all() else ray
+    swept = np.count_nonzero(height_m[ray[:, 0], ray[:, 1]] > _OBJECT_M)
+    return bool(length + swept + _RIM_M / resolution_m <= len(ray))
 
 
 def surface_at(height_m: npt.NDArray[np.float32], cell: tuple[int, int]) -> float:
