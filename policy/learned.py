@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
 # the goal's mask is below a threshold).
 GRASP_THRESHOLD = 0.6
+# Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
+_TRUST = 0.6
 
 
 class LearnedPolicy:
@@ -61,9 +63,11 @@ class LearnedPolicy:
         planes = encode(height_m, observation.heightmap.color)
         may_push = observation.may_push and self._may_push
         grasp = self._grasp(observation, planes, targets, height_m)
-        if may_push and (grasp is None or grasp.q_value < GRASP_THRESHOLD):
+        failed = sum(action.primitive is Primitive.GRASP for action in observation.barred)
+        trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
+        if may_push and trusted < GRASP_THRESHOLD:
             push = self._push(observation, planes, targets, height_m)
-            if push is not None and (grasp is None or push.q_value > grasp.q_value):
+            if push is not None and (grasp is None or push.q_value > trusted):
                 return push
         if grasp is not None:
             return grasp

@@ -114,3 +114,12 @@ def test_broken_maps_are_an_error(network, observation, value):
 def test_an_empty_table_is_no_target(network, observation):
     with pytest.raises(NoTarget, match="no object"):
         decide(network, replace(observation, labels=np.zeros_like(observation.labels), goal=None))
+
+
+def test_grasps_that_failed_make_room_for_a_push(network, observation):
+    network.grasp[5, 110, 115] = 0.9
+    network.grasp[0, 120, 105] = 0.85
+    network.push[0, 112, 112] = 0.7
+    first = decide(network, observation)
+    assert first.primitive is Primitive.GRASP
+    assert decide(network, replace(observation, barred=(first,))).primitive is Primitive.PUSH
