@@ -68,7 +68,7 @@ class Inference:
 
 
 def fuse_norms(network: nn.Module) -> None:
-    """Multiply each norm that follows a convolution into it: the same network for inference, a fifth faster."""
+    """Multiply each norm that follows a convolution into it: the same network for inference, and faster."""
     for child in network.children():
         fuse_norms(child)
     if isinstance(network, nn.Sequential):

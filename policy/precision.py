@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def autocast(device: torch.device) -> AbstractContextManager[None]:
-    """bfloat16 where the processor has instructions for it: half the time, and the same choices but for near ties."""
+    """bfloat16 where the processor has instructions for it: faster, to three digits."""
     if device.type == "cuda" or _cpu_has_bfloat16():
         return torch.autocast(device.type, torch.bfloat16)
     return nullcontext()
