@@ -45,10 +45,7 @@ class HeuristicPolicy:
         Raises:
             NoTarget: no object is seen, or nothing can be done about those that are.
         """
-        targets = observation.objects if observation.goal is None else observation.goal
-        if not targets.any():
-            what = "no object" if observation.goal is None else "no cell of the goal"
-            raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
+        targets = observation.targets()
         heightmap = observation.heightmap
         surface = estimate_surface(heightmap, self._camera, self._table_height_m)
         table = lay_table(surface, _owners(observation), heightmap.workspace.resolution_m, self._jaw.opening_m)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
 # the goal's mask is below a threshold).
-GRASP_THRESHOLD = 0.6
+_GRASP_THRESHOLD = 0.6
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
 
@@ -55,17 +55,14 @@ class LearnedPolicy:
             NoTarget: no object is seen, or nothing is left that did not fail.
             ConfigError: the network's maps are not finite, flat or empty.
         """
-        targets = observation.objects if observation.goal is None else observation.goal
-        if not targets.any():
-            what = "no object" if observation.goal is None else "no cell of the goal"
-            raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
+        targets = observation.targets()
         height_m = close_gaps(observation.heightmap.height_m)
         planes = encode(height_m, observation.heightmap.color)
         may_push = observation.may_push and self._may_push
         grasp = self._grasp(observation, planes, targets, height_m)
         failed = sum(action.primitive is Primitive.GRASP for action in observation.barred)
         trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
-        if may_push and trusted < GRASP_THRESHOLD:
+        if may_push and trusted < _GRASP_THRESHOLD:
             push = self._push(observation, planes, targets, height_m)
             if push is not None and (grasp is None or push.q_value > trusted):
                 return push

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robotcell.decision import ROTATIONS
+from robotcell.perception import MIN_OBJECT_M
 
 if TYPE_CHECKING:
     from robotcell.config import Workspace
@@ -28,7 +29,6 @@ _FREE_HEIGHT_M = 0.008
 _FOLLOW_M = 0.010
 # The height of what is met is taken over so much of its face: the first cells of an edge are uncertain.
 _FACE_M = 0.014
-_OBJECT_M = 0.010
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def push_line(
     outside = np.flatnonzero(((way < 0) | (way >= np.array(free.shape)[:, None])).any(axis=0))
     cells = way.T[: outside[0]] if len(outside) else way.T
     profile = np.nan_to_num(height_m[cells[:, 0], cells[:, 1]], nan=0.0)
-    met = np.flatnonzero(profile > _OBJECT_M)
+    met = np.flatnonzero(profile > MIN_OBJECT_M)
     if not len(met):
         return None
     face = profile[met[0] : met[0] + round(_FACE_M / resolution_m)]

@@ -48,10 +48,7 @@ class RandomPolicy:
         Raises:
             NoTarget: no object is seen, or every action on those that are has failed.
         """
-        targets = observation.objects if observation.goal is None else observation.goal
-        if not targets.any():
-            what = "no object" if observation.goal is None else "no cell of the goal"
-            raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
+        targets = observation.targets()
         heights = estimate_surface(observation.heightmap, self._camera, self._table_height_m).height_m
         order = [Primitive.GRASP, Primitive.PUSH] if observation.may_push else [Primitive.GRASP]
         self._generator.shuffle(order)

@@ -14,17 +14,17 @@ import numpy.typing as npt
 
 from policy.push_line import PushLine, push_line
 from robotcell.errors import ConfigError
+from robotcell.perception import MIN_OBJECT_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 # Paper: 15 dilations of 3x3.
-DILATIONS = 15
+_DILATIONS = 15
 # Cells of the push maps that are tried in the order of their value before pushing is given up.
 _PUSH_TRIES = 2000
 # What is pushed stays this far inside the workspace.
 _RIM_M = 0.02
-_OBJECT_M = 0.010
 # Maps whose values differ by less than this say nothing.
 _FLAT = 1e-6
 
@@ -49,7 +49,7 @@ def check_maps(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], name: st
 
 def push_mask(targets: npt.NDArray[np.bool_], objects: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     """(H, W) cells whose pushes concern the targets: on an object, within 15 cells of them."""
-    grown = cv2.dilate(targets.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=DILATIONS) > 0
+    grown = cv2.dilate(targets.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=_DILATIONS) > 0
     return np.asarray(grown & objects)
 
 
@@ -102,7 +102,7 @@ def _stays_inside(line: PushLine, height_m: npt.NDArray[np.float32], resolution_
     ray = np.rint(first + (last - first) / length * steps[:, None]).astype(np.intp)
     inside = ((ray >= 0) & (ray < height_m.shape)).all(axis=1)
     ray = ray[: int(inside.argmin())] if not inside.all() else ray
-    swept = np.count_nonzero(height_m[ray[:, 0], ray[:, 1]] > _OBJECT_M)
+    swept = np.count_nonzero(height_m[ray[:, 0], ray[:, 1]] > MIN_OBJECT_M)
     return bool(length + swept + _RIM_M / resolution_m <= len(ray))
 
 

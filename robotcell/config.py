@@ -261,7 +261,7 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
     Raises:
         ConfigError: naming every bad key at once, each with its value and what is allowed.
     """
-    values = _read_toml(path) if path else {}
+    values = read_toml(path, "examples/cell.toml") if path else {}
     for key, value in (overrides or {}).items():
         _set(values, key, value)
     problems: list[str] = []
@@ -285,12 +285,21 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
     return config
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path, example: str) -> dict[str, Any]:
+    """The values of a TOML file.
+
+    Args:
+        path: of the file.
+        example: a file to start from, named where there is none.
+
+    Raises:
+        ConfigError: it cannot be read, or is no TOML.
+    """
     try:
         values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
         return values
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; start from examples/cell.toml") from None
+        raise ConfigError(f"{path}: no such file; start from {example}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

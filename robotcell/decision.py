@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from robotcell.errors import NoTarget
+
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
@@ -71,6 +73,18 @@ class Observation:
     def objects(self) -> npt.NDArray[np.bool_]:
         """(H, W) cells that hold an object."""
         return self.labels > 0
+
+    def targets(self) -> npt.NDArray[np.bool_]:
+        """(H, W) cells that an action may aim at: those of the goal, or of every object where there is no goal.
+
+        Raises:
+            NoTarget: none of them is seen.
+        """
+        targets = self.objects if self.goal is None else self.goal
+        if not targets.any():
+            what = "no object" if self.goal is None else "no cell of the goal"
+            raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
+        return targets
 
 
 class Policy(Protocol):

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from policy.inference import Inference
     from policy.training.config import CollectSettings
     from robotcell.config import CellConfig
 
@@ -282,7 +283,3 @@ def _geometric(state: State, config: CellConfig, rng: np.random.Generator) -> li
     weights = found.score[likely].astype(np.float64)
     drawn = rng.choice(likely, size=50, p=weights / weights.sum())
     return [_Choice(GRASP, int(found.rotation[i]), (int(found.row[i]), int(found.col[i]))) for i in drawn]
-
-
-if TYPE_CHECKING:
-    from policy.inference import Inference

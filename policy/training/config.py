@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from robotcell.config import read_toml
 from robotcell.errors import ConfigError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -189,7 +184,7 @@ def load_train_config(path: Path | None = None) -> TrainConfig:
     """
     if path is None:
         return TrainConfig()
-    values = _read(path)
+    values = read_toml(path, "examples/train.toml")
     for name in ("stage1", "stage2"):
         given = values.get(name)
         if isinstance(given, dict):
@@ -222,15 +217,3 @@ def _describe(detail: ErrorDetails) -> str:
     if detail["type"] == "extra_forbidden":
         return f"{key} = {detail['input']!r}: unknown key; see docs/training.md for those that exist"
     return f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}"
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-        return values
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; start from examples/train.toml") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from error

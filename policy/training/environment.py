@@ -26,6 +26,7 @@ from robotcell.decision import ROTATIONS
 from robotcell.errors import ConfigError
 from robotcell.geometry import look_at, make_transform
 from robotcell.heightmap import Heightmap, build_heightmap, close_gaps
+from robotcell.perception import MIN_OBJECT_M
 from robotcell.primitives import grasp_height, near_height, push_height
 from sim_twin.backend import TwinOptions
 from sim_twin.camera import TwinCamera
@@ -47,7 +48,6 @@ _SCATTER = 0.02
 _MOVED_M = 0.005
 # Labels of up to 63 objects travel through the heightmap as one mask for each binary digit.
 _BITS = 6
-_OBJECT_M = 0.010
 # A scene that does not come to rest is drawn again.
 _SCENE_TRIES = 5
 
@@ -255,7 +255,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         heightmap = replace(heightmap, masks={})
         height_m = close_gaps(heightmap.height_m)
         with np.errstate(invalid="ignore"):
-            high = height_m > _OBJECT_M
+            high = height_m > MIN_OBJECT_M
         labels = np.where(high, np.where(labels == 0, cv2.dilate(labels, np.ones((3, 3), np.uint8)), labels), 0)
         labels = labels.astype(np.uint8)
         return State(
