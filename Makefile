@@ -29,7 +29,7 @@ $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	@# The build tool warns about folders that are called like packages; an editable install is meant to use them.
-	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[twin,train,dev]'
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[hardware,twin,train,dev]'
 	@touch $@
 
 clean:

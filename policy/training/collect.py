@@ -38,10 +38,10 @@ _PUSH_TRIES = 25
 _GEOMETRIC_SHARE = 0.5
 # A state whose best grasp succeeds is left by it, or by a push with this probability (stage I, stage II).
 _LEAVE_BY_PUSH = (0.15, 0.35)
-# Stage I: about ten objects, dropped, as the paper has it; or a group. Stage II: thirty, or a group.
+# Stage I: about ten objects, dropped, as the paper has it; or a group. Stage II: up to thirty, or a group.
 _KINDS = {
     1: (("drop", 6, 14, 0.7), ("packed", 4, 10, 0.3)),
-    2: (("drop", 20, 30, 0.4), ("packed", 4, 12, 0.6)),
+    2: (("drop", 14, 30, 0.5), ("packed", 4, 12, 0.5)),
 }
 
 

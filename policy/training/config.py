@@ -103,20 +103,20 @@ class TrainConfig(_Table):
     collect: CollectSettings = CollectSettings()
     learning: LearningSettings = LearningSettings()
     stage1: StageSettings = StageSettings(
-        rounds=10,
+        rounds=8,
         scenes_per_round=36,
-        updates_per_round=250,
-        warmup_rounds=2,
-        exploration_start=0.6,
-        exploration_end=0.15,
+        updates_per_round=350,
+        warmup_rounds=1,
+        exploration_start=0.5,
+        exploration_end=0.1,
     )
     stage2: StageSettings = StageSettings(
         rounds=8,
         scenes_per_round=24,
-        updates_per_round=300,
+        updates_per_round=400,
         warmup_rounds=0,
-        exploration_start=0.3,
-        exploration_end=0.1,
+        exploration_start=0.2,
+        exploration_end=0.05,
     )
 
     def stage(self, number: int) -> StageSettings:

@@ -1,0 +1,1 @@
+"""Drivers of the real devices. Each imports its vendor's library when it connects."""
