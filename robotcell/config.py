@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from robotcell import linkage
+from robotcell.camera_calibration import CameraCalibration, load_calibration
 from robotcell.errors import ConfigError
 from robotcell.geometry import Array, check_transform, look_at
 
@@ -142,7 +143,7 @@ class Limits(_Table):
 
 
 class CameraMount(_Table):
-    """The fixed camera: its mode, and where it stands, by two points or by a transform."""
+    """The fixed camera: its mode, and where it stands, by a calibration, by a transform or by two points."""
 
     resolution: Annotated[str, Field(pattern="^(640x480|1280x720)$")] = "640x480"
     # 20 degrees off the vertical: the taller block of two hides little of the lower one, and the post stands clear.
@@ -150,14 +151,31 @@ class CameraMount(_Table):
     look_at: Vector3 = (-0.5, 0.0, 0.0)
     # T_base_camera, rows of a 4x4 matrix; stands above the two points when given.
     T_base_camera: tuple[tuple[float, ...], ...] | None = None
+    # A file that robotcell calibrate wrote; stands above the two points when given.
+    calibration: Path | None = None
+
+    _measured: CameraCalibration | None = PrivateAttr(None)
 
     @model_validator(mode="after")
     def _is_a_pose(self) -> CameraMount:
+        if self.calibration is not None:
+            if self.T_base_camera is not None:
+                raise ValueError("calibration and T_base_camera both say where the camera stands; keep one")
+            self._measured = load_calibration(self.calibration)
+            if self._measured.mount != "fixed":
+                raise ValueError(f"{self.calibration} is of a camera on the flange; the cell's camera is fixed")
         self.pose()
         return self
 
+    @property
+    def measured(self) -> CameraCalibration | None:
+        """What the calibration file holds; None without one. Whether it fits the camera, its `check` says."""
+        return self._measured
+
     def pose(self) -> Array:
         """T_base_camera (4, 4)."""
+        if self._measured is not None:
+            return self._measured.pose()
         if self.T_base_camera is not None:
             return check_transform(self.T_base_camera, "T_base_camera")
         return look_at(self.position, self.look_at)
