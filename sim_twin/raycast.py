@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import importlib
-import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.drivers.libusb import load_libusb
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 
 Floats = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int32]
-
-_LIBUSB = "libusb-1.0.so.0"
 
 
 @dataclass(frozen=True)
@@ -127,27 +124,12 @@ def load_open3d() -> Any:
     Raises:
         ConfigError: open3d or libusb is not installed.
     """
-    if sys.platform == "linux":
-        try:
-            ctypes.CDLL(_LIBUSB, mode=ctypes.RTLD_GLOBAL)
-        except OSError:
-            _load_packaged_libusb()
+    load_libusb("open3d", "twin")
     try:
         return importlib.import_module("open3d")
     except ImportError as error:
         raise ConfigError(
             f"the twin's camera cannot load open3d ({error}); install the twin: pip install 'robotcell[twin]'"
-        ) from error
-
-
-def _load_packaged_libusb() -> None:
-    try:
-        package = importlib.import_module("libusb_package")
-        ctypes.CDLL(str(package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError) as error:
-        raise ConfigError(
-            f"the twin's camera needs {_LIBUSB}; neither the system nor the package libusb-package has it "
-            f"({error}): install the twin: pip install 'robotcell[twin]'"
         ) from error
 
 

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from robotcell.config import CameraMount
-from sim_twin.camera import MODES, TwinCamera
+from sim_twin.camera import TwinCamera
 from sim_twin.noise import NoiseOptions, degrade_color, degrade_depth
 from sim_twin.raycast import RayCaster
+from sim_twin.renderer import MODES
 from tests.sim_twin.boxes import table_with_blocks
 
 RESOLUTIONS = pytest.mark.parametrize("resolution", sorted(MODES, reverse=True))
