@@ -38,8 +38,8 @@ WATCHDOG_S = 0.1
 # A motion that starts pressed against something may press this much more. Assumed.
 _LEAVING_FORCE_N = 30.0
 
-# Share of the position error that the joint controllers correct within a step.
-_POSITION_GAIN = 0.5
+# Share of the position error that each joint controller corrects within a step.
+JOINT_GAINS = (0.5,) * 6
 # A rotation counts as the way that the flange goes when it turns about the tcp: no end of the tool outruns the speed.
 _ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
 # Two neighbouring samples of a path that differ by more than this are different configurations of the arm.
@@ -231,7 +231,7 @@ class TwinArm(Arm):
         self._command(q)
 
     def _command(self, q: Array) -> None:
-        self._world.drive_positions(self._joints, q.tolist(), robot_model.JOINT_TORQUE_NM, _GAINS)
+        self._world.drive_positions(self._joints, q.tolist(), robot_model.JOINT_TORQUE_NM, JOINT_GAINS)
 
     def _need_connection(self) -> None:
         if not self._connected:
@@ -243,9 +243,6 @@ class TwinArm(Arm):
             raise DeviceFault(f"the arm is in {self._mode.value}: look at the cell, clear the contact, then recover")
         if self.moving:
             raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it")
-
-
-_GAINS = (_POSITION_GAIN,) * 6
 
 
 def _norm(vector: Array) -> float:

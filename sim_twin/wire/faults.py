@@ -6,8 +6,9 @@ Words as in PX4's failure injection: off, stuck, garbage, wrong, slow, delayed, 
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
+
+from pydantic.dataclasses import dataclass
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -27,9 +28,9 @@ class Kind(enum.Enum):
     INTERMITTENT = "intermittent"  # gone and back every `value` seconds
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config={"extra": "forbid", "allow_inf_nan": False})
 class Fault:
-    """One fault.
+    """One fault. Words and types are checked.
 
     Attributes:
         device: that has it.

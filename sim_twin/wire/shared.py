@@ -25,7 +25,8 @@ ARM_COMMAND = np.dtype(
 GRIPPER_COMMAND = np.dtype([("count", "u8"), ("stop", "u1"), ("width_m", "f8"), ("force_n", "f8")])
 # Written by the world once per physics step. `t` is simulated time [s], `wall` time.monotonic() [s] of the step.
 # `wrench`: (6,) [N, N m] that the surroundings exert on the gripper, base axes, about the origin of the flange.
-# `robot_force`: (3,) [N] on arm and gripper together.
+# `robot_force`: (3,) [N] on arm and gripper together. `gripper_count`: of the last gripper command that was taken up.
+# `skipped`: steps that were left out so far, because the physics could not keep up with the clock.
 CELL_STATE = np.dtype(
     [
         ("t", "f8"),
@@ -37,6 +38,8 @@ CELL_STATE = np.dtype(
         ("width_m", "f8"),
         ("busy", "u1"),
         ("grip_detected", "u1"),
+        ("gripper_count", "u8"),
+        ("skipped", "u8"),
     ]
 )
 
