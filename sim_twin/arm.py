@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell import kinematics, linkage
+from robotcell import arm_checks, kinematics, linkage
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import (
     Array,
-    check_transform,
     interpolate_transforms,
     invert_transform,
     rotation_angle,
@@ -42,8 +41,6 @@ _LEAVING_FORCE_N = 30.0
 JOINT_GAINS = (0.5,) * 6
 # A rotation counts as the way that the flange goes when it turns about the tcp: no end of the tool outruns the speed.
 _ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
-# Two neighbouring samples of a path that differ by more than this are different configurations of the arm.
-_BRANCH_STEP_RAD = 0.3
 
 _T_TCP_FLANGE = invert_transform(linkage.T_FLANGE_TCP)
 
@@ -120,15 +117,7 @@ class TwinArm(Arm):
             DeviceFault: the arm is stopped.
         """
         self._need_ready()
-        target = np.asarray(q, dtype=np.float64)
-        if target.shape != (6,) or not np.isfinite(target).all():
-            raise UnsafeMotion(f"joint target {q!r}: six finite angles are needed")
-        if (np.abs(target) > kinematics.JOINT_LIMIT).any():
-            joint = int(np.argmax(np.abs(target) - kinematics.JOINT_LIMIT))
-            limit = kinematics.JOINT_LIMIT[joint]
-            raise UnsafeMotion(f"joint {joint + 1} is sent to {target[joint]:.3f} rad; its limit is {limit:.3f}")
-        _check_range("speed", speed_rad_s, kinematics.MAX_JOINT_SPEED, "rad/s")
-        _check_range("acceleration", acceleration_rad_s2, kinematics.MAX_JOINT_ACCELERATION, "rad/s^2")
+        target = arm_checks.check_joint_motion(q, speed_rad_s, acceleration_rad_s2)
         start = self._path[-1]
         distance = float(np.abs(target - start).max())
         s = trapezoid(distance, speed_rad_s, acceleration_rad_s2, STEP_S)
@@ -145,12 +134,7 @@ class TwinArm(Arm):
             DeviceFault: the arm is stopped.
         """
         self._need_ready()
-        try:
-            T_goal = check_transform(T_base_tcp, "T_base_tcp")
-        except ValueError as error:
-            raise UnsafeMotion(str(error)) from None
-        _check_range("speed", speed_m_s, kinematics.MAX_TOOL_SPEED, "m/s")
-        _check_range("acceleration", acceleration_m_s2, kinematics.MAX_TOOL_ACCELERATION, "m/s^2")
+        T_goal = arm_checks.check_linear_motion(T_base_tcp, speed_m_s, acceleration_m_s2)
         q = self._path[-1]
         T_start = kinematics.forward(q) @ linkage.T_FLANGE_TCP
         turn = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
@@ -160,16 +144,10 @@ class TwinArm(Arm):
             return
         poses = interpolate_transforms(T_start, T_goal, s / distance) @ _T_TCP_FLANGE
         try:
-            path = kinematics.inverse_along(poses, q, _BRANCH_STEP_RAD)
+            path = kinematics.inverse_along(poses, q, arm_checks.BRANCH_STEP_RAD)
         except ValueError as error:
             raise UnsafeMotion(f"straight motion refused: {error}") from None
-        speeds = np.abs(np.diff(path, axis=0, prepend=q[None])) / STEP_S
-        if speeds.max() > kinematics.MAX_JOINT_SPEED:
-            joint = int(np.argmax(speeds.max(axis=0)))
-            raise UnsafeMotion(
-                f"straight motion refused: joint {joint + 1} would have to turn at {speeds.max():.1f} rad/s, its "
-                f"limit is {kinematics.MAX_JOINT_SPEED:.2f}; go slower, or keep away from the singularity"
-            )
+        arm_checks.check_joint_speeds(np.abs(np.diff(path, axis=0, prepend=q[None])) / STEP_S)
         self._start(path)
 
     def stop(self) -> None:
@@ -247,8 +225,3 @@ class TwinArm(Arm):
 
 def _norm(vector: Array) -> float:
     return math.sqrt(float(vector @ vector))
-
-
-def _check_range(what: str, value: float, high: float, unit: str) -> None:
-    if not math.isfinite(value) or not 0 < value <= high:
-        raise UnsafeMotion(f"{what} {value} {unit} is outside the controller's range of above 0 to {high:g} {unit}")
