@@ -10,7 +10,7 @@ import socket
 import struct
 import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from robotcell.errors import ConnectionLost
 
@@ -36,7 +36,17 @@ _FORMATS = {
     "VECTOR6UINT32": "6I",
 }
 
-Value = float | tuple[float, ...]
+Value: TypeAlias = "float | tuple[float, ...]"
+
+
+def as_number(value: Value) -> float:
+    """The value of a variable that holds one number."""
+    return value[0] if isinstance(value, tuple) else value
+
+
+def as_vector(value: Value) -> tuple[float, ...]:
+    """The value of a variable that holds several numbers."""
+    return value if isinstance(value, tuple) else (value,)
 
 
 @contextmanager

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from robotcell.drivers.dashboard import Dashboard
-from robotcell.drivers.rtde import TIMEOUT_S, open_rtde
+from robotcell.drivers.rtde import TIMEOUT_S, as_number, as_vector, open_rtde
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import ArmMode
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from robotcell.drivers.rtde import Value
 
 SCRIPT_PORT = 30003
 # Remote control can be asked for since 5.6, and ur_rtde reads the raw wrench since 5.9.
@@ -110,13 +108,13 @@ def inspect(host: str) -> Controller:
         model=model,
         serial=serial,
         remote=remote,
-        robot_mode=int(_number(values["robot_mode"])),
-        safety_mode=int(_number(values["safety_mode"])),
-        runtime_state=int(_number(values["runtime_state"])),
-        speed_fraction=_number(values["target_speed_fraction"]),
-        payload_kg=_number(values["payload"]),
-        payload_cog=_vector(values["payload_cog"]),
-        tcp_offset=_vector(values["tcp_offset"]),
+        robot_mode=int(as_number(values["robot_mode"])),
+        safety_mode=int(as_number(values["safety_mode"])),
+        runtime_state=int(as_number(values["runtime_state"])),
+        speed_fraction=as_number(values["target_speed_fraction"]),
+        payload_kg=as_number(values["payload"]),
+        payload_cog=as_vector(values["payload_cog"]),
+        tcp_offset=as_vector(values["tcp_offset"]),
     )
 
 
@@ -210,11 +208,3 @@ def _probe_script_port(host: str) -> None:
         socket.create_connection((host, SCRIPT_PORT), TIMEOUT_S).close()
     except OSError as error:
         raise ConnectionLost(f"{host}:{SCRIPT_PORT} (script) cannot be reached: {error}") from error
-
-
-def _number(value: Value) -> float:
-    return value[0] if isinstance(value, tuple) else value
-
-
-def _vector(value: Value) -> tuple[float, ...]:
-    return value if isinstance(value, tuple) else (value,)
