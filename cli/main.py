@@ -26,6 +26,10 @@ app = typer.Typer(
 )
 jobs_app = typer.Typer(help="What past jobs did.", invoke_without_command=True, pretty_exceptions_enable=False)
 app.add_typer(jobs_app, name="jobs")
+twin_app = typer.Typer(
+    help="The simulated cell behind the devices' own protocols.", no_args_is_help=True, pretty_exceptions_enable=False
+)
+app.add_typer(twin_app, name="twin")
 
 CellFile = Annotated[
     Path | None, typer.Option("--cell", help="The cell's TOML file; without one, the twin with its defaults.")
@@ -173,6 +177,35 @@ def bench(
     raise typer.Exit(run_bench(given, resume, json_, workers, ray))
 
 
+@app.command()
+def doctor(
+    cell: CellFile = None,
+    seconds: Annotated[float, typer.Option(min=0.5, max=60, help="How long latencies are measured.")] = 5.0,
+    json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON and nothing else.")] = False,
+) -> None:
+    """Look at every device of a hardware cell, say what is wrong and what to do. Moves nothing.
+
+    Exit codes: 0 nothing is wrong, 2 usage or configuration, 3 something is wrong.
+    """
+    from cli.doctor import run_doctor
+
+    raise typer.Exit(run_doctor(cell, seconds, as_json=json_))
+
+
+@app.command()
+def recover(
+    cell: CellFile = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask: the cell was looked at.")] = False,
+) -> None:
+    """Leave a protective stop, or make an arm ready whose program was stopped. Asks first.
+
+    Exit codes: 0 the arm is ready, 2 usage or configuration, 3 it is not.
+    """
+    from cli.doctor import run_recover
+
+    raise typer.Exit(run_recover(cell, yes=yes))
+
+
 @jobs_app.callback()
 def jobs(
     context: typer.Context,
@@ -192,6 +225,61 @@ def show(job: Annotated[int, typer.Argument(help="The job's number.")], cell: Ce
     from cli.history import show_job
 
     raise typer.Exit(show_job(cell, job))
+
+
+@twin_app.command()
+def serve(
+    host: Annotated[str, typer.Option(help="Address on which everything listens.")] = "127.0.0.2",
+    modbus_port: Annotated[int, typer.Option(min=0, max=65535, help="Of the Compute Box.")] = 1502,
+    camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Of the camera's frames.")] = 30415,
+    control_port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Of the control socket for faults; none unless given.", show_default=False),
+    ] = None,
+    cell: CellFile = None,
+    scene: Annotated[
+        str | None, typer.Option(help="random, novel, challenging-01 to -10, or a scene file.", show_default=False)
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="Folder of the OBJ files that a scene file names.", show_default=False)
+    ] = None,
+    objects: Annotated[
+        int | None, typer.Option(help="How many objects a random scene has.", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same scene.", show_default=False)] = None,
+    expose: Annotated[
+        bool, typer.Option("--expose", help="Listen on an address that other machines can reach.")
+    ] = False,
+) -> None:
+    """Serve a UR5e, an RG2 and a D415 in real time, for any client that speaks their protocols, until interrupted.
+
+    Exit codes: 0 interrupted or terminated, 2 usage or configuration, 3 a server died.
+    """
+    from cli.twin import run_serve
+
+    options = {"scene": scene, "meshes": meshes, "objects": objects, "seed": seed}
+    ports = {"modbus_port": modbus_port, "camera_port": camera_port, "control_port": control_port}
+    given = {key: value for key, value in options.items() if value is not None}
+    raise typer.Exit(run_serve(cell, given, host, ports, expose=expose))
+
+
+@twin_app.command()
+def fault(
+    control: Annotated[str, typer.Option(help="Address of the control socket, host:port.")],
+    words: Annotated[list[str] | None, typer.Argument(metavar="DEVICE CHANNEL KIND [WHAT]")] = None,
+    value: Annotated[
+        float | None, typer.Option(help="Seconds, share or number that the fault needs.", show_default=False)
+    ] = None,
+    clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
+    list_: Annotated[bool, typer.Option("--list", help="Show which faults exist and which are on.")] = False,
+) -> None:
+    """Give a served cell a fault, such as: gripper modbus stuck.
+
+    Exit codes: 0 done, 2 no such fault, 3 nothing is served there.
+    """
+    from cli.twin import run_fault
+
+    raise typer.Exit(run_fault(words or [], value, control, clear=clear, show=list_))
 
 
 def _end(number: int, _frame: FrameType | None) -> NoReturn:

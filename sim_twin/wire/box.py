@@ -47,6 +47,8 @@ _POWER_CYCLE = 2
 # "1-2 s".
 _POWER_CYCLE_S = 1.5
 _WRONG_UNIT = 66
+# Of faults that need a time and got none.
+_USUAL_S = 1.0
 _BUSY, _GRIP_DETECTED, _SAFETY_ERROR = 1 << 0, 1 << 1, 1 << 6
 # Of each safety switch: pushed, and its circuit tripped.
 _SWITCHES = {"s1": (1 << 2, 1 << 3), "s2": (1 << 4, 1 << 5)}
@@ -233,7 +235,7 @@ async def _serve(rg2: Rg2, host: str, port: int, faults: Connection, ready: Conn
         server.garbled = inbox.find("modbus", Kind.GARBAGE) is not None
         refusal, delay = inbox.find("modbus", Kind.WRONG, "exception"), inbox.find("modbus", Kind.DELAYED)
         server.refuses = None if refusal is None else int(refusal.value or Refusal.FAILURE)
-        server.delay_s = 0.0 if delay is None else delay.value or 0.0
+        server.delay_s = 0.0 if delay is None else delay.value or _USUAL_S
         changed.set()
 
     loop.add_signal_handler(signal.SIGTERM, ended.set)
@@ -262,7 +264,7 @@ async def _keep_link(server: ModbusServer, inbox: FaultInbox, changed: asyncio.E
         there = not inbox.find("modbus", Kind.OFF) and not (blinking and there)
         await (server.open() if there else server.close())
         try:
-            await asyncio.wait_for(changed.wait(), blinking.value if blinking else None)
+            await asyncio.wait_for(changed.wait(), (blinking.value or _USUAL_S) if blinking else None)
         except asyncio.TimeoutError:
             continue
         changed.clear()

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import importlib
 import importlib.util
-import math
+import ipaddress
 import multiprocessing
+import socket
 import threading
 from dataclasses import dataclass
 from multiprocessing.connection import wait
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire import box
 from sim_twin.wire.box import serve_box
+from sim_twin.wire.control import Control
 from sim_twin.wire.faults import Device, Fault, Kind
 from sim_twin.wire.shared import ARM_COMMAND, CELL_STATE, GRIPPER_COMMAND, Record
 from sim_twin.wire.world_loop import serve_world
@@ -44,7 +46,7 @@ FAULTS: dict[Device, frozenset[tuple[str, Kind, str]]] = {
     "gripper": box.FAULTS,
     "camera": _OTHERS["camera"].FAULTS if "camera" in _OTHERS else frozenset(),
 }
-_NEEDS_VALUE = (Kind.SLOW, Kind.DELAYED, Kind.INTERMITTENT)
+_TIMED = (Kind.SLOW, Kind.DELAYED, Kind.INTERMITTENT)
 
 
 @dataclass
@@ -85,6 +87,7 @@ class ServedCell:
         self._poses: str | None = None
         self._faults: list[Fault] = []
         self._lock = threading.Lock()
+        self._control: Control | None = None
         self.endpoints: dict[str, str] = {}
 
     def __enter__(self) -> Self:
@@ -142,9 +145,15 @@ class ServedCell:
             self._launch("camera", serve_camera, host, self._camera_port, config, world["visuals"], self._poses)
         for name in (*_OTHERS, "box"):
             self.endpoints.update(self._wait_for(name))
+        if self._control_port is not None:
+            self._control = Control(self, host if is_loopback(host) else "127.0.0.1", self._control_port)
+            self.endpoints["control"] = self._control.endpoint
 
     def close(self) -> None:
         """End everything. Idempotent."""
+        if self._control is not None:
+            self._control.close()
+            self._control = None
         for server in self._servers.values():
             server.process.terminate()
         for server in self._servers.values():
@@ -175,22 +184,28 @@ class ServedCell:
         Raises:
             ConnectionLost: nothing is served.
         """
-        if not self._records:
-            raise ConnectionLost("the cell is not served: start it first")
-        return self._records[2].read()
+        return self._read(2)
+
+    def command(self) -> np.void:
+        """What the UR controller commands now: the record `ARM_COMMAND`.
+
+        Raises:
+            ConnectionLost: nothing is served.
+        """
+        return self._read(0)
 
     def inject(self, fault: Fault) -> None:
         """Have a fault from now on; one of the same place and kind is replaced.
 
         Raises:
-            ConfigError: there is no such fault (the message lists those of the device), or it needs a value.
+            ConfigError: there is no such fault (the message lists those of the device), or its value makes no sense.
         """
-        exists = FAULTS[fault.device]
-        if (fault.channel, fault.kind, fault.what) not in exists:
-            listed = "; ".join(sorted(f"{channel} {kind.value} {what}".strip() for channel, kind, what in exists))
-            raise ConfigError(f"no fault of the {fault.device} is called {describe(fault)!r}; there are: {listed}")
-        if fault.kind in _NEEDS_VALUE and not (fault.value and fault.value > 0 and math.isfinite(fault.value)):
-            raise ConfigError(f"the fault {describe(fault)!r} needs a value above 0")
+        name = f"{fault.channel} {fault.kind.value} {fault.what}".strip()
+        if name not in self.known_faults()[fault.device]:
+            listed = "; ".join(self.known_faults()[fault.device])
+            raise ConfigError(f"no fault of the {fault.device} is called {name!r}; there are: {listed}")
+        if fault.kind in _TIMED and fault.value is not None and fault.value <= 0:
+            raise ConfigError(f"the value of {name!r} must be above 0, not {fault.value:g}")
         with self._lock:
             self._faults = [known for known in self._faults if not _same(known, fault)] + [fault]
             self._send_faults()
@@ -200,6 +215,18 @@ class ServedCell:
         with self._lock:
             self._faults = []
             self._send_faults()
+
+    def known_faults(self) -> dict[str, list[str]]:
+        """The faults that exist, by device: channel, kind and what."""
+        return {
+            device: sorted(f"{channel} {kind.value} {what}".strip() for channel, kind, what in exist)
+            for device, exist in FAULTS.items()
+        }
+
+    def _read(self, record: int) -> np.void:
+        if not self._records:
+            raise ConnectionLost("the cell is not served: start it first")
+        return self._records[record].read()
 
     def _launch(self, name: str, entry: Callable[..., None], *arguments: object) -> None:
         context = multiprocessing.get_context("spawn")
@@ -235,10 +262,12 @@ class ServedCell:
                 server.faults.send(tuple(self._faults))
 
 
-def describe(fault: Fault) -> str:
-    """A fault in words."""
-    value = "" if fault.value is None else f" {fault.value:g}"
-    return f"{fault.channel} {fault.kind.value} {fault.what}".strip() + value
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an address or a name."""
+    try:
+        return ipaddress.ip_address(socket.gethostbyname(host)).is_loopback
+    except OSError:
+        return False
 
 
 def _same(a: Fault, b: Fault) -> bool:

@@ -1,0 +1,116 @@
+"""The control socket of a served cell: faults at run time, a JSON line for a JSON line, for this machine only."""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+import threading
+from typing import TYPE_CHECKING, Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from robotcell.errors import CellError, ConfigError
+from sim_twin.wire.faults import Fault
+
+if TYPE_CHECKING:
+    from sim_twin.wire.serve import ServedCell
+
+REQUESTS = (
+    '{"inject": {"device", "channel", "kind", "what", "value"}}, {"clear": true}, {"list": true}, {"state": true}'
+)
+_FAULT = TypeAdapter(Fault)
+_LONGEST_LINE = 10_000
+_POLL_S = 0.1
+_SEND_S = 1.0
+
+
+def handle(line: bytes, cell: ServedCell) -> dict[str, Any]:
+    """The answer to one line: {"ok": true, ...} or {"ok": false, "error": text}."""
+    try:
+        request = json.loads(line)
+        if not isinstance(request, dict) or len(request) != 1:
+            raise ConfigError(f"one request at a time; there are {REQUESTS}")
+        ((verb, argument),) = request.items()
+        return {"ok": True, **_obey(verb, argument, cell)}
+    except ValidationError as error:
+        problems = "; ".join(f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}" for detail in error.errors())
+        return {"ok": False, "error": f"not a fault: {problems}"}
+    except CellError as error:
+        return {"ok": False, "error": str(error)}
+    except ValueError as error:
+        return {"ok": False, "error": f"not a line of JSON: {error}; there are {REQUESTS}"}
+
+
+def _obey(verb: str, argument: object, cell: ServedCell) -> dict[str, Any]:
+    if verb == "inject":
+        cell.inject(_FAULT.validate_python(argument))
+        return {}
+    if argument is not True or verb not in {"clear", "list", "state"}:
+        raise ConfigError(f"no such request; there are {REQUESTS}")
+    if verb == "clear":
+        cell.clear()
+        return {}
+    if verb == "list":
+        active = [_FAULT.dump_python(fault, mode="json") for fault in cell.faults]
+        return {"exist": cell.known_faults(), "active": active}
+    state = cell.state()
+    return {"state": {name: state[name].tolist() for name in state.dtype.names or ()}}
+
+
+class Control:
+    """Listens for control lines in a thread of its own.
+
+    Args:
+        cell: that gets the faults.
+        host: a loopback address to listen at.
+        port: there; 0 for any.
+    """
+
+    def __init__(self, cell: ServedCell, host: str, port: int) -> None:
+        self._cell = cell
+        self._ended = threading.Event()
+        try:
+            self._listener = socket.create_server((host, port))
+        except OSError as error:
+            raise ConfigError(
+                f"the control socket cannot listen at {host}:{port} ({error.strerror}): take another port"
+            ) from error
+        self.endpoint = f"{host}:{self._listener.getsockname()[1]}"
+        self._thread = threading.Thread(target=self._run, name="robotcell twin control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Hang up and end. Idempotent."""
+        self._ended.set()
+        self._thread.join()
+        self._listener.close()
+
+    def _run(self) -> None:
+        clients: dict[socket.socket, bytearray] = {}
+        while not self._ended.is_set():
+            heard, _, _ = select.select([self._listener, *clients], [], [], _POLL_S)
+            for source in heard:
+                if source is self._listener:
+                    client, _ = self._listener.accept()
+                    client.settimeout(_SEND_S)
+                    clients[client] = bytearray()
+                elif not self._serve(source, clients[source]):
+                    del clients[source]
+                    source.close()
+        for client in clients:
+            client.close()
+
+    def _serve(self, client: socket.socket, received: bytearray) -> bool:
+        """Answer what came; whether the client stays."""
+        try:
+            data = client.recv(4096)
+            received += data
+            while b"\n" in received:
+                end = received.index(b"\n")
+                answer = handle(bytes(received[:end]), self._cell)
+                del received[: end + 1]
+                client.sendall(json.dumps(answer).encode() + b"\n")
+        except OSError:
+            return False
+        return bool(data) and len(received) < _LONGEST_LINE
