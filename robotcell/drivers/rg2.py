@@ -302,7 +302,7 @@ class RG2(Gripper):
         first = (
             f"free the switch {' and '.join(pushed)} that is still pushed" if pushed else "see what pushed the switch"
         )
-        return f"{what}, it will not move; {first}, then power-cycle the gripper by a recover or at the tool changer"
+        return f"{what}, it will not move; {first}, then power-cycle the gripper with `robotcell recover` or at the tool changer"
 
     def _registers(self) -> _Registers:
         values = dict(zip(_STATE, self._read(_STATE.start, len(_STATE), "its state"), strict=True))

@@ -91,18 +91,24 @@ def inspect(host: str) -> Controller:
     Raises:
         ConnectionLost: a port cannot be reached, or what listens there does not answer as a UR controller does.
     """
-    _probe_script_port(host)
-    with open_rtde(host) as rtde:
-        rtde.start(_READ, 125.0)
-        values = rtde.read()
-        version = rtde.version
-    dashboard = Dashboard(host)
     try:
-        dashboard.connect()
-        model, serial = dashboard.ask("get robot model"), dashboard.ask("get serial number")
-        remote = dashboard.ask("is in remote control").strip().lower() == "true"
-    finally:
-        dashboard.close()
+        with open_rtde(host) as rtde:
+            rtde.start(_READ, 125.0)
+            values = rtde.read()
+            version = rtde.version
+        dashboard = Dashboard(host)
+        try:
+            dashboard.connect()
+            model, serial = dashboard.ask("get robot model"), dashboard.ask("get serial number")
+            remote = dashboard.ask("is in remote control").lower() == "true"
+        finally:
+            dashboard.close()
+        _probe_script_port(host)
+    except ConnectionLost as error:
+        raise ConnectionLost(
+            f"the arm: {error}; check that the controller has booted, arm.host, the cable, and that its services are "
+            "enabled (Settings > Security > Services at the pendant)"
+        ) from None
     return Controller(
         version=version,
         model=model,
