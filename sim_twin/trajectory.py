@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,16 +29,40 @@ def trapezoid(distance: float, speed: float, acceleration: float, period: float)
     """
     if distance <= 0:
         return np.empty(0)
-    ramp = min(speed / acceleration, math.sqrt(distance / acceleration))
-    cruise_speed = acceleration * ramp
-    duration = ramp + distance / cruise_speed
-    t = np.arange(1, math.ceil(duration / period) + 1) * period
-    rising = 0.5 * acceleration * np.minimum(t, ramp) ** 2
-    cruising = cruise_speed * np.clip(t - ramp, 0.0, duration - 2 * ramp)
-    falling = np.clip(t - (duration - ramp), 0.0, ramp)
-    s = rising + cruising + falling * (cruise_speed - 0.5 * acceleration * falling)
+    profile = Trapezoid(distance, speed, acceleration)
+    t = np.arange(1, math.ceil(profile.duration / period) + 1) * period
+    s = profile.position(np.asarray(t, dtype=np.float64))
     s[-1] = distance
-    return np.asarray(np.minimum(s, distance))
+    return s
+
+
+@dataclass(frozen=True)
+class Trapezoid:
+    """The profile of `trapezoid` at any time; the arguments are the same, and `distance` is above 0."""
+
+    distance: float
+    speed: float
+    acceleration: float
+
+    @property
+    def ramp(self) -> float:
+        """How long the speed rises [s]."""
+        return min(self.speed / self.acceleration, math.sqrt(self.distance / self.acceleration))
+
+    @property
+    def duration(self) -> float:
+        """How long the motion takes [s]."""
+        return self.ramp + self.distance / (self.acceleration * self.ramp)
+
+    def position(self, t: Array | float) -> Array:
+        """Positions at times [s] from 0 to `duration`, in the shape of `t`."""
+        ramp, duration = self.ramp, self.duration
+        cruise_speed = self.acceleration * ramp
+        rising = 0.5 * self.acceleration * np.minimum(t, ramp) ** 2
+        cruising = cruise_speed * np.clip(t - ramp, 0.0, duration - 2 * ramp)
+        falling = np.clip(t - (duration - ramp), 0.0, ramp)
+        s = rising + cruising + falling * (cruise_speed - 0.5 * self.acceleration * falling)
+        return np.asarray(np.minimum(s, self.distance))
 
 
 def slow_down(path: Array, index: int, deceleration: float, period: float) -> Array:
