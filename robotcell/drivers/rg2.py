@@ -128,7 +128,8 @@ class RG2(Gripper):
             self._check_free(registers)
             shift = registers.tip_width - registers.bare_width
             low, high = round(linkage.MIN_WIDTH_M * _PER_M) + shift, round(linkage.MAX_WIDTH_M * _PER_M) + shift
-            self._range_m = max(0, low) / _PER_M, high / _PER_M
+            # The register of the width takes no more with tips that reach outwards.
+            self._range_m = max(0, low) / _PER_M, min(high / _PER_M, linkage.MAX_WIDTH_M)
             self._command = None
         except BaseException:
             self.close()
@@ -299,10 +300,8 @@ class RG2(Gripper):
             return ""
         pushed = [name for name, bit in _PUSHED.items() if status & bit]
         what = f"safety switch {' and '.join(tripped)} has tripped" if tripped else "safety error at power on"
-        first = (
-            f"free the switch {' and '.join(pushed)} that is still pushed" if pushed else "see what pushed the switch"
-        )
-        return f"{what}, it will not move; {first}, then power-cycle the gripper with `robotcell recover` or at the tool changer"
+        first = f"free switch {' and '.join(pushed)}, which is still pushed" if pushed else "see what pushed the switch"
+        return f"{what}, it will not move; {first}, then power-cycle it with `robotcell recover` or at the tool changer"
 
     def _registers(self) -> _Registers:
         values = dict(zip(_STATE, self._read(_STATE.start, len(_STATE), "its state"), strict=True))

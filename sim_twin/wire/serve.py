@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-import importlib.util
 import ipaddress
 import multiprocessing
 import socket
@@ -15,8 +13,7 @@ from multiprocessing.shared_memory import SharedMemory
 from typing import TYPE_CHECKING, Any
 
 from robotcell.errors import ConfigError, ConnectionLost
-from sim_twin.wire import box
-from sim_twin.wire.box import serve_box
+from sim_twin.wire import box, camera_server, ur
 from sim_twin.wire.control import Control
 from sim_twin.wire.faults import Device, Fault, Kind
 from sim_twin.wire.shared import ARM_COMMAND, CELL_STATE, GRIPPER_COMMAND, Record
@@ -36,15 +33,10 @@ if TYPE_CHECKING:
 # Ten objects are built in half a second; a busy machine may need many times that to import everything.
 _START_S = 90.0
 _END_S = 5.0
-_OTHERS = {
-    name: importlib.import_module(f"sim_twin.wire.{module}")
-    for name, module in (("ur", "ur"), ("camera", "camera_server"))
-    if importlib.util.find_spec(f"sim_twin.wire.{module}")
-}
 FAULTS: dict[Device, frozenset[tuple[str, Kind, str]]] = {
-    "arm": _OTHERS["ur"].FAULTS if "ur" in _OTHERS else frozenset(),
+    "arm": ur.FAULTS,
     "gripper": box.FAULTS,
-    "camera": _OTHERS["camera"].FAULTS if "camera" in _OTHERS else frozenset(),
+    "camera": camera_server.FAULTS,
 }
 _TIMED = (Kind.SLOW, Kind.DELAYED, Kind.INTERMITTENT)
 
@@ -135,16 +127,16 @@ class ServedCell:
         arm, gripper, state = self._records = [Record(ARM_COMMAND), Record(GRIPPER_COMMAND), Record(CELL_STATE)]
         config, host = self._config, self._host
         self._launch("world", serve_world, config, arm.name, gripper.name, state.name)
-        if "ur" in _OTHERS:
-            self._launch("ur", _OTHERS["ur"].serve_ur, host, config.motion.home_q, arm.name, state.name)
-        self._launch("box", serve_box, host, self._modbus_port, gripper.name, state.name)
+        self._launch("ur", ur.serve_ur, host, config.motion.home_q, arm.name, state.name)
+        self._launch("box", box.serve_box, host, self._modbus_port, gripper.name, state.name)
+        # The quick ones first: a port that is taken is said before the world is built.
+        for name in ("ur", "box"):
+            self.endpoints.update(self._wait_for(name))
         world = self._wait_for("world")
         self._poses = world["poses"]
-        if "camera" in _OTHERS:
-            serve_camera = _OTHERS["camera"].serve_camera
-            self._launch("camera", serve_camera, host, self._camera_port, config, world["visuals"], self._poses)
-        for name in (*_OTHERS, "box"):
-            self.endpoints.update(self._wait_for(name))
+        camera = (host, self._camera_port, config, world["visuals"], self._poses)
+        self._launch("camera", camera_server.serve_camera, *camera)
+        self.endpoints.update(self._wait_for("camera"))
         if self._control_port is not None:
             self._control = Control(self, host if is_loopback(host) else "127.0.0.1", self._control_port)
             self.endpoints["control"] = self._control.endpoint

@@ -1,0 +1,307 @@
+"""The driver against a served Compute Box with an RG2; tests/contract holds what every gripper does."""
+
+import threading
+import time
+from multiprocessing import resource_tracker
+
+import pytest
+from pydantic import ValidationError
+from pymodbus.client import ModbusTcpClient
+
+from robotcell.config import load_config
+from robotcell.drivers.clock import WallClock
+from robotcell.drivers.rg2 import RG2, RG2Options
+from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
+from sim_twin.wire.faults import Fault, Kind
+from sim_twin.wire.serve import ServedCell
+
+HOST = "127.0.0.26"
+# No lost, silent or garbling device may hold the program for longer.
+BOUND_S = 1.0
+
+
+@pytest.fixture(scope="module")
+def served():
+    resource_tracker.ensure_running()
+    config = load_config(None, {"backend.options.objects": 1})
+    with ServedCell(config, HOST, modbus_port=0, camera_port=0) as cell:
+        yield cell
+
+
+@pytest.fixture
+def options(served):
+    yield RG2Options(host=HOST, port=int(served.endpoints["modbus"].rpartition(":")[2]), timeout_s=0.3)
+    served.clear()
+
+
+@pytest.fixture
+def gripper(options):
+    with RG2(options, WallClock()) as gripper:
+        yield gripper
+
+
+def inject(served, channel, kind, what="", value=None):
+    """Give the box a fault, and time to have it."""
+    served.inject(Fault("gripper", channel, kind, what, value))
+    time.sleep(0.1)
+
+
+def go(gripper, width_m, force_n=20.0):
+    gripper.start_width(width_m, force_n)
+    finish(gripper)
+    return gripper.state()
+
+
+def finish(gripper):
+    while gripper.state().busy:
+        time.sleep(0.01)
+
+
+def raw(options):
+    """A client of the test's own."""
+    client = ModbusTcpClient(options.host, port=options.port, timeout=1, retries=0)
+    assert client.connect()
+    return client
+
+
+def test_the_world_sees_what_the_driver_does(served, gripper):
+    state = go(gripper, 0.03)
+    assert state.width_m == pytest.approx(0.03, abs=5e-4)
+    assert served.state()["width_m"] == pytest.approx(0.03, abs=5e-4)
+    go(gripper, 0.08)
+
+
+@pytest.mark.parametrize("offset", [0.005, -0.004])
+def test_widths_are_between_the_tips_whatever_is_mounted(served, options, offset):
+    with RG2(options.model_copy(update={"fingertip_offset_m": offset}), WallClock()) as gripper:
+        assert go(gripper, 0.05).width_m == pytest.approx(0.05, abs=5e-4)
+        assert served.state()["width_m"] == pytest.approx(0.05 + 2 * offset, abs=5e-4)
+        widest = min(0.11, 0.11 - 2 * offset)
+        assert go(gripper, widest).width_m == pytest.approx(widest, abs=5e-4)
+        for width in (widest + 0.001, max(0.0, -2 * offset) - 0.001):
+            with pytest.raises(UnsafeMotion, match="outside"):
+                gripper.start_width(width, 20.0)
+    with RG2(options, WallClock()) as gripper:
+        assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
+
+
+def test_the_same_command_under_way_is_not_sent_again(served, gripper):
+    gripper.start_width(0.02, 20.0)
+    first = served.state()["gripper_count"]
+    end = time.monotonic() + 5
+    while served.state()["gripper_count"] == first and time.monotonic() < end:
+        time.sleep(0.002)
+    count = served.state()["gripper_count"]
+    gripper.start_width(0.02, 20.0)
+    time.sleep(0.05)
+    assert served.state()["gripper_count"] == count
+    go(gripper, 0.08)
+
+
+def test_a_second_client_is_told_why_it_is_not_served(options, gripper):
+    with pytest.raises(ConnectionLost, match="one client at a time"):
+        RG2(options, WallClock()).connect()
+    assert not gripper.state().busy
+
+
+def test_nobody_there(options):
+    began = time.monotonic()
+    with pytest.raises(ConnectionLost, match="nothing answers"):
+        RG2(options.model_copy(update={"host": "127.0.0.27"}), WallClock()).connect()
+    assert time.monotonic() - began < BOUND_S
+
+
+LOST = [
+    ("off", Kind.OFF, "", None, "hung up"),
+    ("silent", Kind.STUCK, "", None, "gave no answer"),
+    ("garbled", Kind.GARBAGE, "", None, "no Modbus"),
+    ("other unit", Kind.WRONG, "unit", None, "unit 65"),
+    ("too late", Kind.DELAYED, "", 0.5, "gave no answer"),
+    ("blinking", Kind.INTERMITTENT, "", 0.5, "hung up"),
+]
+
+
+@pytest.mark.parametrize("call", ["state", "start", "stop"])
+@pytest.mark.parametrize(("kind", "what", "value", "words"), [row[1:] for row in LOST], ids=[row[0] for row in LOST])
+def test_a_lost_link_is_said_in_time_and_comes_back_by_connect(served, gripper, call, kind, what, value, words):
+    inject(served, "modbus", kind, what, value)
+    began = time.monotonic()
+    with pytest.raises(ConnectionLost, match=words):
+        {"state": gripper.state, "stop": gripper.stop, "start": lambda: gripper.start_width(0.08, 20.0)}[call]()
+    assert time.monotonic() - began < BOUND_S
+    with pytest.raises(ConnectionLost, match="connect again"):
+        gripper.state()
+    served.clear()
+    time.sleep(0.1)
+    with pytest.raises(ConnectionLost):
+        gripper.state()
+    gripper.connect()
+    assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
+
+
+@pytest.mark.parametrize(("kind", "what"), [(Kind.OFF, ""), (Kind.STUCK, ""), (Kind.GARBAGE, ""), (Kind.WRONG, "unit")])
+def test_connect_fails_in_time_and_leaves_nothing(served, options, kind, what):
+    inject(served, "modbus", kind, what)
+    gripper = RG2(options, WallClock())
+    began = time.monotonic()
+    with pytest.raises(ConnectionLost):
+        gripper.connect()
+    assert time.monotonic() - began < BOUND_S
+    served.clear()
+    time.sleep(0.1)
+    with gripper:
+        assert not gripper.state().busy
+
+
+def test_an_exception_response_is_not_a_lost_link(served, gripper):
+    inject(served, "modbus", Kind.WRONG, "exception", 4)
+    with pytest.raises(DeviceFault, match=r"exception 4 \(device failure\)"):
+        gripper.state()
+    served.clear()
+    time.sleep(0.1)
+    assert not gripper.state().busy
+
+
+def test_a_command_that_got_no_answer_is_not_repeated(served, gripper):
+    before = int(served.state()["gripper_count"])
+    inject(served, "modbus", Kind.DELAYED, "", 0.5)
+    with pytest.raises(ConnectionLost):
+        gripper.stop()
+    time.sleep(1.0)
+    assert served.state()["gripper_count"] == before + 1
+
+
+@pytest.mark.parametrize("switch", ["s1", "s2"])
+def test_a_tripped_switch_stops_everything_until_an_operator_recovers(served, options, gripper, switch):
+    gripper.start_width(0.02, 20.0)
+    inject(served, "state", Kind.WRONG, switch)
+    for call in (gripper.state, lambda: gripper.start_width(0.05, 20.0)):
+        with pytest.raises(DeviceFault, match=f"{switch.upper()} has tripped.*still pushed.*robotcell recover"):
+            call()
+    stopped = served.state()["width_m"]
+    served.clear()
+    time.sleep(0.1)
+    gripper.close()
+    gripper = RG2(options, WallClock())
+    with pytest.raises(DeviceFault, match="see what pushed"):
+        gripper.connect()
+    gripper.recover()
+    with gripper:
+        assert gripper.state().width_m == pytest.approx(stopped, abs=0.002)
+        assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
+
+
+def test_recover_leaves_a_gripper_that_is_free_as_it_is(served, gripper):
+    before = int(served.state()["gripper_count"])
+    gripper.recover()
+    assert served.state()["gripper_count"] == before
+    assert not gripper.state().busy
+
+
+def test_recover_cannot_cure_a_switch_that_is_still_pushed(served, options, monkeypatch):
+    monkeypatch.setattr("robotcell.drivers.rg2._POWER_CYCLE_S", 2.0)
+    gripper = RG2(options, WallClock())
+    inject(served, "state", Kind.WRONG, "s1")
+    with pytest.raises(DeviceFault, match="still pushed"):
+        gripper.recover()
+    served.clear()
+    time.sleep(0.1)
+    gripper.recover()
+    with gripper:
+        assert not gripper.state().busy
+
+
+def test_a_safety_error_is_refused_at_connect(served, options):
+    inject(served, "state", Kind.WRONG, "safety_error")
+    gripper = RG2(options, WallClock())
+    with pytest.raises(DeviceFault, match="safety error at power on"):
+        gripper.connect()
+    served.clear()
+    time.sleep(0.1)
+    gripper.recover()
+
+
+def test_an_offset_that_does_not_stay_is_a_fault(served, options, gripper):
+    inject(served, "state", Kind.WRONG, "offset", 0.003)
+    with pytest.raises(DeviceFault, match=r"offset is 3\.0 mm, the cell's is 0\.0 mm"):
+        gripper.state()
+    gripper.close()
+    with pytest.raises(DeviceFault, match="offset"):
+        RG2(options, WallClock()).connect()
+
+
+def test_busy_for_ever_is_busy_and_takes_no_new_command(served, gripper):
+    inject(served, "state", Kind.WRONG, "busy")
+    assert gripper.state().busy
+    with pytest.raises(DeviceFault, match="still busy"):
+        gripper.start_width(0.05, 20.0)
+
+
+def test_fingers_that_do_not_arrive_and_hold_nothing_are_a_fault(served, gripper):
+    inject(served, "state", Kind.STUCK)
+    gripper.start_width(0.03, 20.0)
+    with pytest.raises(DeviceFault, match=r"rest 80\.\d mm apart, were sent to 30\.0 mm"):
+        finish(gripper)
+    served.clear()
+    time.sleep(0.1)
+    assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
+
+
+def test_a_grip_bit_at_the_commanded_width_is_no_grip(served, gripper):
+    go(gripper, 0.05)
+    inject(served, "state", Kind.WRONG, "grip")
+    assert not gripper.state().grip_detected
+    served.clear()
+    go(gripper, 0.08)
+
+
+def test_another_device_is_not_driven(options, monkeypatch):
+    monkeypatch.setattr("robotcell.drivers.rg2._PRODUCTS", {0x20: "RG6"})
+    with pytest.raises(DeviceFault, match="is RG6, not an RG2"):
+        RG2(options, WallClock()).connect()
+
+
+def test_close_stops_the_fingers_and_frees_the_box(served, options):
+    gripper = RG2(options, WallClock())
+    gripper.connect()
+    gripper.start_width(0.0, 20.0)
+    time.sleep(0.2)
+    gripper.close()
+    time.sleep(0.2)
+    stopped = served.state()
+    assert not stopped["busy"]
+    assert stopped["width_m"] > 0.02
+    client = raw(options)
+    assert client.read_holding_registers(268, count=1, device_id=65).registers == [0]
+    client.close()
+    with gripper:
+        go(gripper, 0.08)
+
+
+def test_close_is_safe_on_a_link_that_died(served, gripper):
+    gripper.start_width(0.08, 20.0)
+    inject(served, "modbus", Kind.STUCK)
+    began = time.monotonic()
+    gripper.close()
+    gripper.close()
+    assert time.monotonic() - began < BOUND_S
+
+
+def test_no_thread_is_started(options):
+    before = threading.active_count()
+    with RG2(options, WallClock()):
+        assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"port": 0}, {"unit": 248}, {"timeout_s": 2.0}, {"fingertip_offset_m": 0.1}, {"adress": "192.168.1.1"}]
+)
+def test_options_are_checked(wrong):
+    with pytest.raises(ValidationError):
+        RG2Options(**wrong)
+
+
+def test_without_the_library_the_cure_is_named(options, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pymodbus.client", None)
+    with pytest.raises(ConfigError, match=r"robotcell\[hardware\]"):
+        RG2(options, WallClock()).connect()
