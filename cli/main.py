@@ -282,6 +282,33 @@ def fault(
     raise typer.Exit(run_fault(words or [], value, control, clear=clear, show=list_))
 
 
+@twin_app.command()
+def record(
+    out: Annotated[Path, typer.Option(help="The .db3 file to write.")],
+    seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long.")] = 3.0,
+    cell: CellFile = None,
+    scene: Annotated[
+        str | None, typer.Option(help="random, novel, challenging-01 to -10, or a scene file.", show_default=False)
+    ] = None,
+    meshes: Annotated[
+        Path | None, typer.Option(help="Folder of the OBJ files that a scene file names.", show_default=False)
+    ] = None,
+    objects: Annotated[
+        int | None, typer.Option(help="How many objects a random scene has.", show_default=False)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="The same seed gives the same scene.", show_default=False)] = None,
+) -> None:
+    """Record what the camera sees of a scene, for librealsense to play, or as camera.source of a cell.
+
+    Exit codes: 0 recorded, 2 usage or configuration, 3 the recording failed.
+    """
+    from cli.twin_record import run_record
+
+    options = {"scene": scene, "meshes": meshes, "objects": objects, "seed": seed}
+    given = {key: value for key, value in options.items() if value is not None}
+    raise typer.Exit(run_record(cell, given, out, seconds))
+
+
 def _end(number: int, _frame: FrameType | None) -> NoReturn:
     sys.exit(128 + number)
 

@@ -61,7 +61,7 @@ def run_serve(
                 f"{host} can be reached from other machines, and the twin asks nobody who they are: take an address "
                 "such as 127.0.0.2, or say --expose"
             )
-        config = _as_twin(cell_file, options)
+        config = as_twin(cell_file, options)
         served = ServedCell(config, host, **{name: port for name, port in ports.items() if port is not None})
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, _end)
@@ -116,7 +116,7 @@ def _end(_number: int, _frame: FrameType | None) -> NoReturn:
     raise KeyboardInterrupt
 
 
-def _as_twin(cell_file: Path | None, options: Mapping[str, Any]) -> CellConfig:
+def as_twin(cell_file: Path | None, options: Mapping[str, Any]) -> CellConfig:
     """The cell with the twin for its backend, whatever it was."""
     backend = load_config(cell_file).backend
     own = backend.options if backend.name == "twin" else {}

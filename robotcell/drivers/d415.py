@@ -35,8 +35,8 @@ _RETURN_S = 10.0
 _POLL_S = 0.2
 # Exposure, read-out and transfer of a frame: by how much it is older than its arrival, where the camera does not say.
 _TRANSFER_S = 0.05
-# Depth and colour of one moment; more than half a period apart they are of two.
-_SAME_MOMENT_S = 0.5 / FRAMES_PER_S
+# Depth and colour of one moment; more than a period apart they are of two.
+_SAME_MOMENT_S = 1 / FRAMES_PER_S
 # Of pixels with depth, and mean count of 255: an image below is of a covered or broken camera, or of no light at all.
 _MIN_DEPTH_SHARE = 0.01
 _MIN_BRIGHTNESS = 5.0

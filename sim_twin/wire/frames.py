@@ -7,16 +7,26 @@ and the two images for a frame. All numbers in network order, pixels of depth li
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from dataclasses import dataclass
-from typing import Annotated, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from robotcell.errors import ConnectionLost
+from sim_twin.noise import DEPTH_UNIT_M
+from sim_twin.renderer import FRAMES_PER_S
 
+if TYPE_CHECKING:
+    from robotcell.interfaces import Intrinsics
+
+SERIAL = "000000000415"
+
+# One that current SDKs take.
+_FIRMWARE = "5.15.1.55"
 _MAGIC = b"D415"
 _MESSAGE = struct.Struct("!4sBI")
 # Width, height, and number and time of the depth image and of the colour image.
@@ -66,6 +76,19 @@ class Description(_Json):
     fy: _Positive
     cx: float
     cy: float
+
+
+def describe(optics: Intrinsics, serial: str = SERIAL, usb_type: str = "3.2") -> Description:
+    """The description of the twin's D415 in a mode with these intrinsics."""
+    return Description(
+        name="Intel RealSense D415",
+        serial=serial,
+        firmware=_FIRMWARE,
+        usb_type=usb_type,
+        frames_per_s=FRAMES_PER_S,
+        depth_unit_m=DEPTH_UNIT_M,
+        **dataclasses.asdict(optics),
+    )
 
 
 @dataclass(frozen=True)
