@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotcell.drivers.realsense import load_pyrealsense2, sdk_errors
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.backend import open_twin
 from sim_twin.noise import DEPTH_UNIT_M
 from sim_twin.renderer import FRAMES_PER_S, MODES
 from sim_twin.wire.d415_device import SoftwareCamera
-from sim_twin.wire.frames import Frame, Image, describe
+from sim_twin.wire.frames import Frame, Image, describe, encode, read_message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from io import BufferedRandom
     from pathlib import Path
 
     from robotcell.config import CellConfig
@@ -30,13 +33,13 @@ SUFFIX = ".db3"
 def record(config: CellConfig, path: Path, frames: int, tell: Callable[[int], None] = lambda _: None) -> None:
     """Write a recording of a twin whose arm stands at home.
 
-    Frames are written as they are rendered, at most 30 a second, and play at the pace at which they were written.
+    All frames are rendered first, and then written at the pace at which they are to be played, 30 a second.
 
     Args:
         config: the cell; its backend must be the twin.
         path: of the file, which must not exist yet.
         frames: how many.
-        tell: called with the number of frames so far.
+        tell: called with the number of frames rendered so far.
 
     Raises:
         ConfigError: the file cannot be written there, or the scene cannot be built.
@@ -49,16 +52,29 @@ def record(config: CellConfig, path: Path, frames: int, tell: Callable[[int], No
     if not path.parent.is_dir():
         raise ConfigError(f"{path.parent}: no such folder")
     camera = SoftwareCamera(describe(MODES[config.camera.resolution]))
-    try:
-        with open_twin(config)[0] as cell, sdk_errors(f"writing {path}"), _recording(path, camera):
+    with tempfile.TemporaryFile() as rendered:
+        with open_twin(config)[0] as cell:
             for count in range(1, frames + 1):
-                due = time.monotonic() + 1 / FRAMES_PER_S
-                camera.show(_as_streamed(cell.camera.read()))
+                rendered.write(encode(_as_streamed(cell.camera.read())))
                 tell(count)
-                time.sleep(max(0.0, due - time.monotonic()))
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
+        rendered.seek(0)
+        try:
+            with sdk_errors(f"writing {path}"), _recording(path, camera):
+                _show(rendered, camera)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+
+
+def _show(rendered: BufferedRandom, camera: SoftwareCamera) -> None:
+    """Show all frames, 30 a second: at this pace they are played."""
+    due = time.monotonic()
+    with suppress(ConnectionLost):  # the end of the file
+        while isinstance(frame := read_message(rendered), Frame):
+            time.sleep(max(0.0, due - time.monotonic()))
+            due += 1 / FRAMES_PER_S
+            now = time.time()
+            camera.show(Frame(replace(frame.depth, t=now), replace(frame.color, t=now)))
 
 
 @contextmanager
@@ -80,6 +96,5 @@ def _recording(path: Path, camera: SoftwareCamera) -> Iterator[None]:
 
 
 def _as_streamed(frame: RgbdFrame) -> Frame:
-    now = time.time()
     depth = np.rint(frame.depth_m / np.float32(DEPTH_UNIT_M)).astype(np.uint16)
-    return Frame(Image(frame.number, now, depth), Image(frame.number, now, frame.color))
+    return Frame(Image(frame.number, frame.t, depth), Image(frame.number, frame.t, frame.color))
