@@ -8,13 +8,13 @@ import sys
 import time
 from multiprocessing.shared_memory import SharedMemory
 
-import psutil
 import pytest
 
 from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.faults import Fault, Kind
 from sim_twin.wire.serve import ServedCell, is_loopback
+from tests.processes import lives
 
 HOST = "127.0.0.23"
 ONE = load_config(None, {"backend.options.objects": 1})
@@ -66,10 +66,12 @@ def test_the_world_and_the_controller_live(served):
         time.sleep(0.01)
 
 
-def test_a_port_that_is_taken_is_named(served):
-    port = int(served.endpoints["modbus"].rpartition(":")[2])
-    with pytest.raises(ConfigError, match=f"{HOST}:{port}"):
-        ServedCell(ONE, HOST, modbus_port=port, camera_port=0).start()
+def test_a_port_that_is_taken_is_named():
+    host = "127.0.0.28"
+    with socket.create_server((host, 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(ConfigError, match=f"{host}:{port}"):
+            ServedCell(ONE, host, modbus_port=port, camera_port=0).start()
 
 
 def test_only_a_twin_can_be_served():
@@ -178,6 +180,6 @@ def test_no_server_outlives_a_supervisor_that_was_killed(tmp_path):
         assert len(pids) == 4
         supervisor.kill()
     end = time.monotonic() + LIMIT_S
-    while any(psutil.pid_exists(pid) for pid in pids):
+    while any(lives(pid) for pid in pids):
         assert time.monotonic() < end
         time.sleep(0.05)

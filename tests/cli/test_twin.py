@@ -1,0 +1,120 @@
+"""`robotcell twin` as a person starts it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+from pymodbus.client import ModbusTcpClient
+from typer.testing import CliRunner
+
+from cli.main import app
+from tests.processes import lives
+
+LIMIT_S = 60.0
+COMMAND = [sys.executable, "-c", "from cli.main import main; main()", "twin"]
+PORTS = ["--modbus-port", "0", "--camera-port", "0", "--control-port", "0"]
+
+
+class Serving:
+    """The command in a process of its own, and the addresses that it prints."""
+
+    def __init__(self, host):
+        self.process = subprocess.Popen(
+            [*COMMAND, "serve", "--host", host, "--objects", "1", "--seed", "3", *PORTS],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.lines = []
+        while not self.lines or "control socket" not in self.lines[-1]:
+            line = self.process.stdout.readline()
+            assert line, self.process.stderr.read()
+            self.lines.append(line)
+        self.servers = [child.pid for child in psutil.Process(self.process.pid).children(recursive=True)]
+
+    def address(self, word):
+        return next(line.split()[-1] for line in self.lines if word in line)
+
+    def end(self, number):
+        os.kill(self.process.pid, number)
+        _, errors = self.process.communicate(timeout=LIMIT_S)
+        return self.process.returncode, errors
+
+
+@pytest.fixture(scope="module")
+def serving():
+    serving = Serving("127.0.0.29")
+    yield serving
+    assert serving.end(signal.SIGTERM) == (0, "")
+    assert not [server for server in serving.servers if lives(server)]
+
+
+def run(*words):
+    result = CliRunner().invoke(app, ["twin", *map(str, words)])
+    return result.exit_code, result.output
+
+
+def test_says_what_to_connect_where(serving):
+    for word in ("RTDE", "dashboard", "Modbus TCP", "twin://127.0.0.29:", "control socket"):
+        host, port = serving.address(word).rsplit(":", 1)
+        with socket.create_connection((host, int(port)), timeout=5):
+            pass
+
+
+def test_gives_and_takes_faults(serving):
+    control = serving.address("control socket")
+    host, port = serving.address("Modbus TCP").rsplit(":", 1)
+    assert run("fault", "--control", control, "gripper", "modbus", "wrong", "exception", "--value", 4) == (0, "")
+    code, output = run("fault", "--control", control, "--list")
+    assert code == 0
+    assert "on: gripper modbus wrong exception 4.0" in output
+    client = ModbusTcpClient(host, port=int(port), timeout=1, retries=0)
+    assert client.connect()
+    assert client.read_holding_registers(1536, count=1, device_id=65).exception_code == 4
+    assert run("fault", "--control", control, "--clear") == (0, "")
+    time.sleep(0.2)
+    assert client.read_holding_registers(1536, count=1, device_id=65).registers == [0x20]
+    client.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["gripper", "modbus", "slow"], 2, "modbus delayed"),
+        (["gripper", "modbus", "asleep"], 2, "intermittent"),
+        (["gripper", "modbus"], 2, "DEVICE CHANNEL KIND"),
+        ([], 2, "DEVICE CHANNEL KIND"),
+    ],
+)
+def test_a_fault_that_does_not_exist_is_told_from_those_that_do(serving, words, code, said):
+    got, output = run("fault", "--control", serving.address("control socket"), *words)
+    assert got == code
+    assert said in output
+
+
+@pytest.mark.parametrize(("control", "code"), [("127.0.0.29:1", 3), ("127.0.0.29", 2)])
+def test_no_control_socket(control, code):
+    assert run("fault", "--control", control, "--list")[0] == code
+
+
+def test_an_interrupt_ends_it_clean():
+    serving = Serving("127.0.0.22")
+    assert serving.end(signal.SIGINT) == (0, "")
+    assert not [server for server in serving.servers if lives(server)]
+
+
+def test_refuses_to_be_reached_by_others_unless_told():
+    code, output = run("serve", "--host", "0.0.0.0")
+    assert code == 2
+    assert "--expose" in output
+
+
+def test_a_wrong_scene_is_said_before_anything_starts():
+    code, output = run("serve", "--host", "127.0.0.22", "--objects", 99)
+    assert code == 2
+    assert "objects = 99" in output
