@@ -11,7 +11,6 @@ import gc
 import select
 import signal
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -132,6 +131,8 @@ class _Server:
         self._connection = faults
         self._inbox = FaultInbox(faults, "arm")
         self._state_faults = StateFaults(self._controller)
+        # The faults of now, by channel, kind and what.
+        self._present: frozenset[tuple[str, Kind, str]] = frozenset()
         self._claims: dict[str, RtdeSession] = {}
         self._running = True
         self._started = time.monotonic()
@@ -185,22 +186,23 @@ class _Server:
             payload_kg=controller.payload.mass,
         )
         self._send(now, Snapshot(controller))
+        controller.execution_time = time.monotonic() - now
 
     def _at_rest(self, now: float) -> np.void:
         """What a world that has not begun yet would say."""
-        cell = np.zeros((), CELL_STATE)
-        cell["wall"], cell["q"] = now, self._q
-        record: np.void = cell[()]
-        return record
+        cells = np.zeros(1, CELL_STATE)
+        cells["wall"], cells["q"] = now, self._q
+        return cells[0]  # type: ignore[no-any-return]
 
     # Reading
 
     def _listen_until(self, deadline: float) -> None:
         """Serve the sockets until a time, at least once."""
+        for port in (self._rtde, self._dashboard, self._script):
+            self._follow_fault(port)
         while True:
             readers: dict[Any, tuple[Port, Client | None]] = {}
             for port in self._ports:
-                self._follow_fault(port)
                 if port.listener is not None:
                     readers[port.listener] = (port, None)
                 if not self._stuck(port):
@@ -232,8 +234,7 @@ class _Server:
 
     def _session(self, port: Port) -> Session:
         if port is self._rtde:
-            wrong = partial(self._inbox.find, "rtde", Kind.WRONG)
-            return RtdeSession(self._controller, self._claims, lambda what: wrong(what) is not None)
+            return RtdeSession(self._controller, self._claims, lambda what: self._has("rtde", Kind.WRONG, what))
         if port is self._dashboard:
             return DashboardSession(self._controller)
         return _ReadOnlySession() if "read-only" in port.name else _ScriptSession(self._controller)
@@ -259,6 +260,7 @@ class _Server:
             return
         if changed:
             self._state_faults.apply(self._inbox)
+            self._present = frozenset(fault for fault in FAULTS if self._inbox.find(*fault))
             for port, channel in ((self._rtde, "rtde"), (self._dashboard, "dashboard")):
                 delay = self._inbox.find(channel, Kind.DELAYED)
                 for client in port.clients:
@@ -323,20 +325,19 @@ class _Server:
     # Faults of the links
 
     def _garbled(self, port: Port, data: bytes) -> bytes:
-        if port is self._rtde and self._inbox.find("rtde", Kind.GARBAGE):
-            return _BAD_HEADER
-        if port is self._rtde and self._inbox.find("rtde", Kind.GARBAGE, "zero_length"):
-            return _EMPTY_PACKAGE
-        if port is self._dashboard and self._inbox.find("dashboard", Kind.GARBAGE):
-            return _BAD_LINE
-        return data
+        if self._has(port.name, Kind.GARBAGE):
+            return _BAD_HEADER if port is self._rtde else _BAD_LINE
+        return _EMPTY_PACKAGE if self._has(port.name, Kind.GARBAGE, "zero_length") else data
+
+    def _has(self, channel: str, kind: Kind, what: str = "") -> bool:
+        return (channel, kind, what) in self._present
 
     def _stuck(self, port: Port) -> bool:
-        return self._inbox.find(port.name, Kind.STUCK) is not None
+        return self._has(port.name, Kind.STUCK)
 
     def _follow_fault(self, port: Port) -> None:
         """Close a port that is to be off, with its clients; open it again when that is over."""
-        gone = self._inbox.find(port.name, Kind.OFF) is not None
+        gone = self._has(port.name, Kind.OFF)
         coming_and_going = self._inbox.find(port.name, Kind.INTERMITTENT)
         if coming_and_going is not None:
             since = time.monotonic() - self._started

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell import kinematics
-from robotcell.geometry import invert_transform
 from sim_twin.wire import ur_motion
 from sim_twin.wire.ur_controller import Payload, Watchdog
 from sim_twin.wire.ur_motion import PERIOD_S, ForceMode, Motion, Move, ScriptError
@@ -423,11 +422,10 @@ class ControlLoop:
         return True
 
     def _forward(self) -> None:
-        T_base_flange = self._arm.forward(self._six(0)) @ invert_transform(self._arm.T_flange_tcp)
-        self._answer_floats(matrix_to_pose(T_base_flange @ pose_to_matrix(self._floats(6, 6))))
+        self._answer_floats(matrix_to_pose(self._arm.flange(self._six(0)) @ pose_to_matrix(self._floats(6, 6))))
 
     def _transform(self) -> None:
         self._answer_floats(matrix_to_pose(pose_to_matrix(self._floats(0, 6)) @ pose_to_matrix(self._floats(6, 6))))
 
     def _flange_pose(self) -> Pose:
-        return matrix_to_pose(self._arm.forward(self._arm.measured_q) @ invert_transform(self._arm.T_flange_tcp))
+        return matrix_to_pose(self._arm.flange(self._arm.measured_q))

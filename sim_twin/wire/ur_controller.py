@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from robotcell.geometry import Array
     from sim_twin.wire.ur_program import Program
 
-VERSION = (5, 12, 6, 1102059)
+VERSION = (5, 12, 0, 1101319)
 SERIAL_NUMBER = "20225500001"
 MODEL = "UR5"
 
@@ -132,6 +132,7 @@ class Controller:
 
     Attributes:
         time: seconds since the controller started.
+        execution_time: how long the whole last period took its process [s].
         notes: (title, text) of what happened, for the clients that read messages; the server takes them out.
         remote: whether the pendant is in remote control.
         slider: the speed slider, 0 to 1.
@@ -146,6 +147,7 @@ class Controller:
         self.payload = Payload()
         self.gravity: tuple[float, ...] = (0.0, 0.0, 9.82)
         self.time = 0.0
+        self.execution_time = 0.0
         self.ticks = 0
         self.notes: deque[tuple[str, str]] = deque(maxlen=100)
         self.remote = True
@@ -375,11 +377,10 @@ class Controller:
         self.robot_mode = RobotMode.RUNNING
 
     def _measure(self, cell: np.void) -> None:
-        arm = self.arm
-        arm.measured_q, arm.measured_qd, arm.wrench = cell["q"], cell["qd"], cell["wrench"]
-        self._force_n = float(np.linalg.norm(cell["robot_force"]))
-        self.joint_history.append(arm.measured_q)
-        self._force_history.append(arm.tcp_wrench()[:3])
+        self.arm.measure(cell["q"], cell["qd"], cell["wrench"])
+        self._force_n = math.hypot(*cell["robot_force"].tolist())
+        self.joint_history.append(self.arm.measured_q)
+        self._force_history.append(self.arm.tcp_wrench[:3])
 
     def _switch_power(self) -> None:
         if self._power_at is not None and self.time >= self._power_at:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sim_twin.wire.ur_controller import Controller
 
 GREETING = b"Connected: Universal Robots Dashboard Server\n"
-SOFTWARE = f"URSoftware {'.'.join(map(str, VERSION))} (Jul 06 2022)"
+SOFTWARE = f"URSoftware {'.'.join(map(str, VERSION))} (Mar 22 2022)"
 
 _MAX_LINE = 4096
 _NOT_ALLOWED = "Command is not allowed due to safety reasons"

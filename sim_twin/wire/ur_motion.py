@@ -28,6 +28,8 @@ _ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
 # Two targets of neighbouring periods may differ by this much: half more than at the fastest joint speed.
 _MAX_STEP_RAD = 1.5 * kinematics.MAX_JOINT_SPEED * PERIOD_S
 _ARRIVED_RAD = 1e-9
+# Inverse kinematics is exact to this many digits; an arm that follows them stands still.
+_STEADY_RAD_S = 1e-5
 
 Motion: TypeAlias = Generator[None, None, None]
 
@@ -48,6 +50,7 @@ class Arm:
         qdd: (6,) its acceleration [rad/s^2].
         measured_q, measured_qd: (6,) of the joints [rad, rad/s].
         wrench: (6,) force [N] and torque [N m] on the tool, base axes, about the flange.
+        tcp_wrench: (6,) the same about the tcp, less what the sensor was zeroed at.
         rate: how much motion time passes per period, 0 to 1: slider and pause.
         tcp: pose of the tool centre point in the flange.
         freedrive: whether the targets follow the joints.
@@ -63,6 +66,7 @@ class Arm:
         self.measured_q = self.q.copy()
         self.measured_qd = np.zeros(6)
         self.wrench = np.zeros(6)
+        self.tcp_wrench = np.zeros(6)
         self.rate = 1.0
         self.freedrive = False
         self.force_mode: ForceMode | None = None
@@ -79,7 +83,7 @@ class Arm:
     @property
     def steady(self) -> bool:
         """Whether the target stands still."""
-        return not self._momentum.any() and not self.qd.any()
+        return bool(max(np.abs(self._momentum).max(), np.abs(self.qd).max()) < _STEADY_RAD_S)
 
     @property
     def momentum(self) -> Array:
@@ -92,9 +96,13 @@ class Arm:
         self.T_flange_tcp = pose_to_matrix(tcp)
         self._T_tcp_flange = invert_transform(self.T_flange_tcp)
 
+    def flange(self, q: Array) -> Array:
+        """T_base_flange of joint angles (6,); a tenth of the time of `kinematics.forward`."""
+        return np.asarray(ur5e.forward_kinematics(*q))
+
     def forward(self, q: Array) -> Array:
         """T_base_tcp of joint angles (6,)."""
-        return np.asarray(ur5e.forward_kinematics(*q) @ self.T_flange_tcp)
+        return np.asarray(self.flange(q) @ self.T_flange_tcp)
 
     def inverse(self, T_base_tcp: Array, q_near: Array) -> Array:
         """The joint angles (6,) nearest to `q_near` that reach a pose of the tcp.
@@ -117,9 +125,10 @@ class Arm:
         w = rotation_vector(T_next[:3, :3] @ T[:3, :3].T)
         return np.concatenate([T_next[:3, 3] - T[:3, 3], w]) / h
 
-    def tcp_wrench(self) -> Array:
-        """(6,) force [N] and torque [N m] on the tool about the tcp, base axes, less what it was zeroed at."""
-        return self._wrench_at_tcp() - self._zero_wrench
+    def measure(self, q: Array, qd: Array, wrench: Array) -> None:
+        """Take in what was measured of the joints, each (6,), and of the wrench about the flange (6,)."""
+        self.measured_q, self.measured_qd, self.wrench = q, qd, wrench
+        self.tcp_wrench = self._wrench_at_tcp() - self._zero_wrench
 
     def zero_wrench(self) -> None:
         """Count from here what the sensor reads now."""
@@ -169,14 +178,16 @@ class Arm:
         self._commanded = False
 
     def _wrench_at_tcp(self) -> Array:
-        arm = ur5e.forward_kinematics(*self.measured_q)[:3, :3] @ self.T_flange_tcp[:3, 3]
+        if not self.wrench.any():
+            return self.wrench
+        arm = self.flange(self.measured_q)[:3, :3] @ self.T_flange_tcp[:3, 3]
         fx, fy, fz, tx, ty, tz = self.wrench.tolist()
         x, y, z = arm.tolist()
         return np.array([fx, fy, fz, tx - (y * fz - z * fy), ty - (z * fx - x * fz), tz - (x * fy - y * fx)])
 
     def _give_way(self, mode: ForceMode) -> None:
         T = self.forward(self.q)
-        twist = mode.twist(self.tcp_wrench())
+        twist = mode.twist(self.tcp_wrench)
         if not twist.any():
             return
         try:

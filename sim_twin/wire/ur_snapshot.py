@@ -6,9 +6,8 @@ models stands at a constant that a resting UR5e would show, see `_CONSTANTS`.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from robotcell import kinematics
 from sim_twin.wire.ur_controller import RobotMode, RuntimeState, SafetyMode
@@ -25,6 +24,7 @@ _SIX = (0.0,) * 6
 _THREE = (0.0,) * 3
 _JOINT_RUNNING, _JOINT_IDLE, _JOINT_POWER_OFF = 253, 255, 239
 _TOOL_RUNNING = 253
+_SHOULDER, _UPPER_ARM = float(kinematics.DH_D[0]), float(kinematics.DH_A[1])
 
 # Currents and torques are not modelled; temperatures and voltages are those of an arm at rest.
 _CONSTANTS: dict[str, Value] = {
@@ -39,7 +39,6 @@ _CONSTANTS: dict[str, Value] = {
     "actual_digital_input_bits": 0,
     "actual_configurable_digital_input_bits": 0,
     "joint_temperatures": (30.0,) * 6,
-    "actual_execution_time": 0.0,
     "target_execution_time": 0.0,
     "actual_tool_accelerometer": _THREE,
     "actual_momentum": 0.0,
@@ -129,26 +128,31 @@ def _tcp_speed(controller: Controller, q: Array, qd: Array) -> list[float]:
 
 
 def _elbow(controller: Controller) -> list[float]:
-    return _list(kinematics.link_frames(controller.arm.measured_q)[2, :3, 3])
+    """The origin of the second Denavit-Hartenberg frame."""
+    base, shoulder = controller.arm.measured_q[:2].tolist()
+    reach = _UPPER_ARM * math.cos(shoulder)
+    return [reach * math.cos(base), reach * math.sin(base), _SHOULDER + _UPPER_ARM * math.sin(shoulder)]
 
 
 def _elbow_speed(controller: Controller) -> list[float]:
-    arm, h = controller.arm, 1e-6
-    before, after = kinematics.link_frames(np.stack([arm.measured_q, arm.measured_q + h * arm.measured_qd]))[
-        :, 2, :3, 3
-    ]
-    return _list((after - before) / h)
+    base, shoulder = controller.arm.measured_q[:2].tolist()
+    base_speed, shoulder_speed = controller.arm.measured_qd[:2].tolist()
+    out = -_UPPER_ARM * math.sin(shoulder) * shoulder_speed
+    around = _UPPER_ARM * math.cos(shoulder) * base_speed
+    c, s = math.cos(base), math.sin(base)
+    return [c * out - s * around, s * out + c * around, _UPPER_ARM * math.cos(shoulder) * shoulder_speed]
 
 
 def _raw_wrench(controller: Controller) -> list[float]:
     """As the sensor has it: axes of the flange, nothing subtracted."""
     arm = controller.arm
-    R = kinematics.forward(arm.measured_q)[:3, :3]
+    R = arm.flange(arm.measured_q)[:3, :3]
     return _list(R.T @ arm.wrench[:3]) + _list(R.T @ arm.wrench[3:])
 
 
 _SOURCES: dict[str, Callable[[Controller], Value]] = {
     "timestamp": lambda c: c.time,
+    "actual_execution_time": lambda c: c.execution_time,
     "control_step": lambda c: c.ticks,
     "target_q": lambda c: c.arm.q.tolist(),
     "target_qd": lambda c: c.arm.qd.tolist(),
@@ -157,7 +161,7 @@ _SOURCES: dict[str, Callable[[Controller], Value]] = {
     "actual_qd": lambda c: c.arm.measured_qd.tolist(),
     "actual_TCP_pose": lambda c: tcp_pose(c.arm, c.arm.measured_q),
     "actual_TCP_speed": lambda c: _tcp_speed(c, c.arm.measured_q, c.arm.measured_qd),
-    "actual_TCP_force": lambda c: c.arm.tcp_wrench().tolist(),
+    "actual_TCP_force": lambda c: c.arm.tcp_wrench.tolist(),
     "target_TCP_pose": lambda c: tcp_pose(c.arm, c.arm.q),
     "target_TCP_speed": lambda c: _tcp_speed(c, c.arm.q, c.arm.qd),
     "tcp_offset": lambda c: c.arm.tcp,
@@ -179,9 +183,9 @@ _SOURCES: dict[str, Callable[[Controller], Value]] = {
     "analog_io_types": lambda c: c.outputs.analog_types << 2,
     "standard_analog_output0": lambda c: _analog(c, 0),
     "standard_analog_output1": lambda c: _analog(c, 1),
-    "tcp_force_scalar": lambda c: float(np.linalg.norm(c.arm.tcp_wrench()[:3])),
+    "tcp_force_scalar": lambda c: math.hypot(*c.arm.tcp_wrench[:3].tolist()),
     "ft_raw_wrench": _raw_wrench,
-    "wrench_calc_from_currents": lambda c: c.arm.tcp_wrench().tolist(),
+    "wrench_calc_from_currents": lambda c: c.arm.tcp_wrench.tolist(),
     "payload": lambda c: c.payload.mass,
     "payload_cog": lambda c: c.payload.cog,
     "payload_inertia": lambda c: c.payload.inertia,

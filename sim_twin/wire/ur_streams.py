@@ -36,7 +36,7 @@ def version_message() -> bytes:
         struct.pack(">B", len(name))
         + name
         + struct.pack(">BBii", major, minor, bugfix, build)
-        + b"06-07-2022, 00:00:00"
+        + b"22-03-2022, 00:00:00"
     )
     return _robot_message(_NO_TIMESTAMP, _VERSION_MESSAGE, body)
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from sim_twin.wire.shared import ARM_COMMAND, CELL_STATE, Record
 from sim_twin.wire.ur import serve_ur
+from sim_twin.wire.ur_motion import PERIOD_S
 
 if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
@@ -75,13 +76,13 @@ class ServedController:
         return np.array(self.command.read()["q"])
 
     def _follow(self) -> None:
-        q, qd, before = np.array(START_Q), np.zeros(6), time.monotonic()
+        q, qd, before = np.array(START_Q), np.zeros(6), 0
         while not self._ended.wait(0.002):
             command = self.command.read()
-            now = time.monotonic()
-            if command["tick"] and not self.held:
-                qd = (command["q"] - q) / (now - before)
+            now, tick = time.monotonic(), int(command["tick"])
+            if tick > before and not self.held:
+                qd = (command["q"] - q) / ((tick - before) * PERIOD_S)
                 q = np.array(command["q"])
-            before = now
+            before = tick
             wrench = np.concatenate([self.push, np.zeros(3)])
             self.state.write(t=now, wall=now, q=q, qd=qd, wrench=wrench, robot_force=self.push)

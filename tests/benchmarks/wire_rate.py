@@ -1,0 +1,98 @@
+"""How well the served UR controller keeps its 500 Hz. Run it: python -m tests.benchmarks.wire_rate [seconds] [--cell].
+
+The arm is a perfect one, so this is the server alone; with --cell it is the whole served cell, ten objects and all.
+Three clients: one reads every variable but the registers and does the timing, one only reads the time, and one sends
+servo commands to the control loop at 500 Hz.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+import psutil
+
+from sim_twin.wire.ur_variables import OUTPUTS
+from tests.sim_twin.wire.control_script import CONTROL_SCRIPT
+from tests.sim_twin.wire.plant import START_Q, ServedController
+from tests.sim_twin.wire.rtde_client import RtdeClient, reading
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_HOST = "127.0.0.18"
+_NAMES = [name for name in OUTPUTS if "register" not in name]
+_SERVO = 11
+
+
+@contextlib.contextmanager
+def _served(whole: bool) -> Iterator[int]:
+    """Serve; gives the process of the controller."""
+    if not whole:
+        with ServedController(_HOST) as served:
+            yield served.process.pid or 0
+        return
+    from robotcell.config import CellConfig
+    from sim_twin.wire.serve import ServedCell
+
+    config = CellConfig.model_validate({"backend": {"name": "twin", "options": {"scene": "random"}}})
+    with ServedCell(config, host=_HOST) as cell:
+        yield cell.processes["ur"]
+
+
+def _servo(ended: threading.Event) -> None:
+    """Run the control script and move the base to and fro by servo commands."""
+    names = ["input_int_register_0", *(f"input_double_register_{i}" for i in range(11))]
+    with RtdeClient(_HOST) as client, socket.create_connection((_HOST, 30003), timeout=2) as script:
+        client.negotiate()
+        recipe, _ = client.inputs(names)
+        script.sendall(CONTROL_SCRIPT)
+        begin = deadline = time.monotonic()
+        while not ended.is_set():
+            t = time.monotonic() - begin
+            q = (START_Q[0] + 0.2 * np.sin(t), *START_Q[1:])
+            client.write(recipe, _SERVO, *q, 0.5, 0.5, 0.002, 0.1, 300.0)
+            deadline += 0.002
+            time.sleep(max(0.0, deadline - time.monotonic()))
+
+
+def main(seconds: float, whole: bool) -> None:
+    """Measure and print."""
+    with _served(whole) as pid, reading(_HOST, *_NAMES) as reader, reading(_HOST, "timestamp"):
+        ended = threading.Event()
+        servo = threading.Thread(target=_servo, args=(ended,))
+        servo.start()
+        process = psutil.Process(pid)
+        for _ in range(250):
+            reader.package()
+        process.cpu_percent()
+        arrivals, stamps, execution = [], [], []
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            package = reader.package()
+            arrivals.append(time.monotonic())
+            stamps.append(package["timestamp"])
+            execution.append(package["actual_execution_time"])
+        cpu = process.cpu_percent()
+        ended.set()
+        servo.join()
+    t, stamp = np.array(arrivals), np.array(stamps, dtype=np.float64)
+    # The least late package sets the origin.
+    late = (t - stamp) - (t - stamp).min()
+    lines = (
+        f"rate        {(len(t) - 1) / (t[-1] - t[0]):.2f} Hz over {t[-1] - t[0]:.1f} s",
+        f"left out    {round((stamp[-1] - stamp[0]) / 0.002) - (len(t) - 1)} periods",
+        "lateness    p50 {:.2f}, p99 {:.2f}, max {:.2f} ms".format(*(np.percentile(late, [50, 99, 100]) * 1e3)),
+        "one period  p50 {:.2f}, p99 {:.2f}, max {:.2f} ms".format(*(np.percentile(execution, [50, 99, 100]) * 1e3)),
+        f"processor   {cpu:.0f} % of a core",
+    )
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main(float(next((word for word in sys.argv[1:] if word[0].isdigit()), 10.0)), "--cell" in sys.argv)
