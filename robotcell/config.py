@@ -151,7 +151,8 @@ class CameraMount(_Table):
     look_at: Vector3 = (-0.5, 0.0, 0.0)
     # T_base_camera, rows of a 4x4 matrix; stands above the two points when given.
     T_base_camera: tuple[tuple[float, ...], ...] | None = None
-    # A file that robotcell calibrate wrote; stands above the two points when given.
+    # A file that robotcell calibrate wrote; stands above the two points when given. A twin's camera really stands where
+    # the two points have it, and this file is what the program believes.
     calibration: Path | None = None
 
     _measured: CameraCalibration | None = PrivateAttr(None)
@@ -174,8 +175,10 @@ class CameraMount(_Table):
 
     def pose(self) -> Array:
         """T_base_camera (4, 4)."""
-        if self._measured is not None:
-            return self._measured.pose()
+        return self.nominal() if self._measured is None else self._measured.pose()
+
+    def nominal(self) -> Array:
+        """T_base_camera (4, 4) without the calibration file: by the transform, or by the two points."""
         if self.T_base_camera is not None:
             return check_transform(self.T_base_camera, "T_base_camera")
         return look_at(self.position, self.look_at)

@@ -90,6 +90,7 @@ class RgbdFrame:
         color: (H, W, 3) uint8 RGB.
         depth_m: (H, W) float32 [m] along the optical axis, 0 = no return.
         intrinsics: of both images, in the colour optical frame.
+        serial: of the device; None where it is not known.
     """
 
     t: float
@@ -97,6 +98,7 @@ class RgbdFrame:
     color: npt.NDArray[np.uint8]
     depth_m: npt.NDArray[np.float32]
     intrinsics: Intrinsics
+    serial: str | None = None
 
 
 class Clock(Protocol):

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from robotcell.cell import Cell
+from robotcell.geometry import make_transform, rotvec_to_matrix
 from sim_twin.noise import NoiseOptions
 
 if TYPE_CHECKING:
-    from robotcell.config import CellConfig
+    from robotcell.config import CameraMount, CellConfig
+    from robotcell.geometry import Array
     from sim_twin.world import World
 
 
@@ -24,6 +26,9 @@ class TwinOptions(BaseModel):
         seed: of the scene and of the camera's noise; the same seed gives the same job.
         meshes: folder of the OBJ files that a scene file names.
         noise: what the camera adds to the truth.
+        board: the gripper holds the calibration board (docs/calibration.md), a little differently for each seed.
+        camera_offset: how far the camera really stands from where `camera` has it without a calibration: position [m]
+            and rotation vector [rad], base axes. A camera that was moved, or never measured.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -33,6 +38,14 @@ class TwinOptions(BaseModel):
     seed: Annotated[int, Field(ge=0)] = 0
     meshes: Path | None = None
     noise: NoiseOptions = NoiseOptions()
+    board: bool = False
+    camera_offset: tuple[float, float, float, float, float, float] = (0.0,) * 6
+
+    def camera_pose(self, mount: CameraMount) -> Array:
+        """T_base_camera (4, 4) of where the twin's camera really stands, whatever a calibration says of it."""
+        T = mount.nominal()
+        d, turn = self.camera_offset[:3], rotvec_to_matrix(self.camera_offset[3:])
+        return make_transform(turn @ T[:3, :3], T[:3, 3] + d)
 
 
 class TwinBackend:
@@ -56,5 +69,5 @@ def open_twin(config: CellConfig) -> tuple[Cell, World]:
 
     options = TwinOptions.model_validate(config.backend.options)
     world = World(config, options)
-    camera = TwinCamera(world, config.camera, options.noise, options.seed)
+    camera = TwinCamera(world, config.camera, options.noise, options.seed, options.camera_pose(config.camera))
     return Cell(config, TwinArm(world), TwinGripper(world), camera, TwinClock(world)), world

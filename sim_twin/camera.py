@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
 from typing import TYPE_CHECKING
 
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import Camera, RgbdFrame
 from sim_twin.noise import WARM_UP_FRAMES, NoiseOptions
 from sim_twin.raycast import Indices, load_open3d
-from sim_twin.renderer import FRAMES_PER_S, Floats, Renderer
+from sim_twin.renderer import FRAMES_PER_S, MODES, Floats, Renderer
+from sim_twin.wire.frames import SERIAL
 from sim_twin.world import STEP_S
 
 if TYPE_CHECKING:
     from robotcell.config import CameraMount
+    from robotcell.geometry import Array
     from sim_twin.world import World
 
 _STEPS_PER_FRAME = round(1 / (FRAMES_PER_S * STEP_S))
@@ -30,11 +33,20 @@ class TwinCamera(Camera):
         mount: resolution and place.
         noise: which errors of the device to make.
         seed: of the errors; the same seed at the same time gives the same frame.
+        T_base_camera: where it really stands (4, 4); where the mount has it without a calibration unless given.
     """
 
-    def __init__(self, world: World, mount: CameraMount, noise: NoiseOptions, seed: int) -> None:
+    def __init__(
+        self,
+        world: World,
+        mount: CameraMount,
+        noise: NoiseOptions,
+        seed: int,
+        T_base_camera: Array | None = None,
+    ) -> None:
         self._world = world
         self._mount = mount
+        self._T_base_camera = mount.nominal() if T_base_camera is None else T_base_camera
         self._noise = noise
         self._seed = seed
         self._first_frame: int | None = None
@@ -45,9 +57,14 @@ class TwinCamera(Camera):
 
         Raises:
             ConfigError: open3d is not installed, or the world cannot be built.
+            CalibrationError: the calibration is of another camera or another resolution.
         """
         if self._first_frame is not None:
             return
+        if self._mount.measured is not None:
+            optics = MODES[self._mount.resolution]
+            # Nobody leans on a simulated camera: its calibration does not age.
+            self._mount.measured.check(serial=SERIAL, resolution=(optics.width, optics.height), max_age=timedelta.max)
         load_open3d()
         self._world.attach(self)
         try:
@@ -92,6 +109,7 @@ class TwinCamera(Camera):
             color=renderer.measured_color(renderer.color(hits), number, t, number - first_frame),
             depth_m=renderer.measured_depth(hits.depth_m, renderer.incidence_cos(hits), number),
             intrinsics=renderer.intrinsics,
+            serial=SERIAL,
         )
         return frame, hits.visual()
 
@@ -120,5 +138,5 @@ class TwinCamera(Camera):
     def _prepare(self) -> Renderer:
         visuals = self._world.visuals()
         if self._renderer is None or visuals is not self._renderer.visuals:
-            self._renderer = Renderer(visuals, self._mount, self._noise, self._seed)
+            self._renderer = Renderer(visuals, self._mount, self._noise, self._seed, self._T_base_camera)
         return self._renderer

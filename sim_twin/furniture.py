@@ -12,6 +12,7 @@ from sim_twin.robot_model import Part, Vector
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
+    from robotcell.geometry import Array
 
 FurnitureKind = Literal["table", "bin", "post"]
 
@@ -29,12 +30,17 @@ _D415_M = (0.099, 0.023, 0.020)
 _GLASS_M = 0.003
 
 
-def furniture(config: CellConfig) -> tuple[tuple[FurnitureKind, Part], ...]:
-    """Every standing part with its kind."""
+def furniture(config: CellConfig, T_base_camera: Array) -> tuple[tuple[FurnitureKind, Part], ...]:
+    """Every standing part with its kind.
+
+    Args:
+        config: of the cell.
+        T_base_camera: where the camera really stands (4, 4).
+    """
     return (
         ("table", _table(config)),
         *(("bin", part) for part in _bin(config)),
-        *(("post", part) for part in _camera(config)),
+        *(("post", part) for part in _camera(config, T_base_camera)),
     )
 
 
@@ -66,9 +72,8 @@ def _bin(config: CellConfig) -> list[Part]:
     ]
 
 
-def _camera(config: CellConfig) -> list[Part]:
+def _camera(config: CellConfig, T_base_camera: Array) -> list[Part]:
     """The housing behind the optical centre, and the post where the safety layer expects it."""
-    T_base_camera = config.camera.pose()
     housing = T_base_camera @ make_transform(np.eye(3), (0.0, 0.0, -_GLASS_M - _D415_M[2] / 2))
     parts = [Part("box", _D415_M, housing, _CAMERA_COLOR)]
     post = camera_post(config)

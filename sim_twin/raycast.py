@@ -34,6 +34,7 @@ class Hits:
         visual_of: (T + 1,) int32, the visual that each triangle belongs to; -1 in the last row.
         normal_of: (T + 1, 3) float32, unit normals in base on the side of the camera; 0 in the last row.
         range_of: (T + 1,) float32, distance [m] from camera to plane of each triangle; 0 in the last row.
+        poses: (K, 4, 4), where the visuals were in base.
     """
 
     depth_m: Floats
@@ -41,6 +42,7 @@ class Hits:
     visual_of: Indices
     normal_of: Floats
     range_of: Floats
+    poses: Array
 
     def visual(self) -> Indices:
         """(H, W) index of the visual that each pixel sees, -1 for none."""
@@ -107,6 +109,7 @@ class RayCaster:
             visual_of=self._visual_of,
             normal_of=np.append(normals, np.zeros((1, 3), np.float32), axis=0),
             range_of=np.append(np.abs(ranges), np.float32(0)),
+            poses=poses,
         )
 
     def _in_base(self, poses: Array) -> Floats:

@@ -69,7 +69,7 @@ _DROP_TRIES = 20
 # The lowest point of a falling object starts this far above what lies below it.
 _DROP_HEIGHT_M = 0.05
 
-Kind = Literal["table", "bin", "post", "arm", "gripper", "object"]
+Kind = Literal["table", "bin", "post", "arm", "gripper", "board", "object"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,8 @@ class Visual:
         color: (3,) uint8 RGB.
         kind: what it belongs to.
         object_index: place among `World.objects()`; -1 for everything else.
+        texture: (h, w, 3) uint8 RGB, stretched over a rectangle in place of `color`; the four vertices are its corners:
+            top left, top right, bottom right, bottom left.
     """
 
     vertices: npt.NDArray[np.float32]
@@ -89,6 +91,7 @@ class Visual:
     color: npt.NDArray[np.uint8]
     kind: Kind
     object_index: int = -1
+    texture: npt.NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)
@@ -344,7 +347,7 @@ class World:
         built = self._need()
         p, client = built.engine, built.client
         bodies = []
-        for _, part in furniture(self.config):
+        for _, part in furniture(self.config, self._options.camera_pose(self.config.camera)):
             shape = p.createCollisionShape(p.GEOM_BOX, halfExtents=[s / 2 for s in part.size], physicsClientId=client)
             T = part.T_link_part
             body = p.createMultiBody(0, shape, -1, T[:3, 3].tolist(), quaternion(T), physicsClientId=client)
@@ -393,7 +396,7 @@ class World:
         for crank in (robot_model.LEFT_CRANK, robot_model.RIGHT_CRANK):
             inertia = [_CRANK_INERTIA_KG_M2] * 3
             p.changeDynamics(robot, joints[crank], localInertiaDiagonal=inertia, physicsClientId=client)
-        angle = linkage.crank_angle(self.config.gripper.preshape_m)
+        angle = linkage.crank_angle(0.0 if self._options.board else self.config.gripper.preshape_m)
         for name, value in {**start, **robot_model.finger_angles(angle)}.items():
             p.resetJointState(robot, joints[name], value, physicsClientId=client)
             p.setJointMotorControl2(robot, joints[name], p.VELOCITY_CONTROL, force=0, physicsClientId=client)
@@ -579,7 +582,7 @@ class World:
     def _make_visuals(self) -> None:
         built = self._need()
         entries: list[tuple[Visual, tuple[str, int]]] = []
-        for kind, part in furniture(self.config):
+        for kind, part in furniture(self.config, self._options.camera_pose(self.config.camera)):
             entries.append((_part_visual((part,), kind), ("fixed", 0)))
         entries += self._robot_visuals()
         for i, item in enumerate(built.scene_objects):
@@ -602,6 +605,10 @@ class World:
             entries += [(_part_visual(group, body), ("link", index)) for group in _by_color(link.parts)]
         for side in (0, 1):
             entries.append((_part_visual(robot_model.second_crank_parts(), "gripper"), ("second crank", side)))
+        if self._options.board:
+            from sim_twin.held_board import board_visuals
+
+            entries += [(visual, ("link", joints["flange"])) for visual in board_visuals(self._options.seed)]
         return entries
 
 

@@ -20,6 +20,7 @@ _FACES = np.array(
 class Box:
     size: tuple[float, float, float]
     color: np.ndarray = field(default_factory=lambda: np.array([200, 200, 200], np.uint8))
+    texture: None = None
 
     @property
     def vertices(self):
