@@ -135,7 +135,8 @@ def _watch(served: ServedCell) -> NoReturn:
     """Show how it goes, until a signal comes or a server dies."""
     console = progress()
     before = None
-    with console.status("serving") if console.is_terminal else nullcontext() as line:
+    status = console.status("serving; Ctrl-C ends it", refresh_per_second=2)
+    with status if console.is_terminal else nullcontext() as line:
         while True:
             time.sleep(_STATUS_S)
             if served.ended:
@@ -153,10 +154,8 @@ def _status(before: tuple[Any, Any], now: tuple[Any, Any], clients: Mapping[str,
     factor = float(state["t"] - state_before["t"]) / seconds
     rate = float(command["tick"] - command_before["tick"]) / seconds
     connected = ", ".join(f"{count} {name}" for name, count in clients.items() if count) or "none"
-    return (
-        f"real time x {factor:.3f}, {int(state['skipped'])} steps left out; controller {rate:.0f} Hz; "
-        f"clients: {connected}; Ctrl-C ends it"
-    )
+    left_out = int(state["skipped"])
+    return f"real time x {factor:.3f}, {left_out} steps left out; controller {rate:.0f} Hz; clients: {connected}"
 
 
 def _clients(endpoints: Mapping[str, str]) -> dict[str, int]:
