@@ -97,6 +97,7 @@ class D415(Camera):
         self._source: CameraSource | None = None
         self._pipeline: Any = None
         self._images: D415Images | None = None
+        self._serial: str | None = None
         self._last_number = -1
         # Frames of earlier rounds of a recorded file.
         self._earlier_numbers = 0
@@ -152,7 +153,7 @@ class D415(Camera):
                     color, depth_m = self._images.make(framesets)
                     framesets.clear()
                     _check_images(color, depth_m)
-                    return RgbdFrame(t, number, color, depth_m, self._images.intrinsics)
+                    return RgbdFrame(t, number, color, depth_m, self._images.intrinsics, self._serial)
             except DeviceFault as fault:
                 problem = fault
         raise problem
@@ -171,8 +172,9 @@ class D415(Camera):
         else:
             context = rs.context()
             device = self._open_recording(rs, context, config)
+        self._serial = serial_number(device)
         if self._mount.measured is not None:
-            self._mount.measured.check(serial=serial_number(device), resolution=(width, height))
+            self._mount.measured.check(serial=self._serial, resolution=(width, height))
         self._start(rs, context, config, device)
 
     @property
@@ -213,10 +215,9 @@ class D415(Camera):
         return device
 
     def _start(self, rs: Any, context: Any, config: Any, device: Any) -> None:
-        serial = serial_number(device)
         for last_try in (False, False, True):
             if last_try:
-                self._reset(context, device, serial)
+                self._reset(context, device)
             try:
                 self._stream(rs, context, config)
                 return
@@ -239,7 +240,7 @@ class D415(Camera):
         self._images = D415Images(profile, self._options.spatial_filter)
         self.read()
 
-    def _reset(self, context: Any, device: Any, serial: str) -> None:
+    def _reset(self, context: Any, device: Any) -> None:
         try:
             device.hardware_reset()
         except RuntimeError:
@@ -248,7 +249,7 @@ class D415(Camera):
         deadline = self._clock.now() + _RETURN_S
         while True:
             try:
-                find_device(context, serial)
+                find_device(context, self._serial)
                 return
             except ConnectionLost:
                 if self._clock.now() > deadline:

@@ -1,17 +1,16 @@
 """What the processes of a served cell tell each other, in shared memory: nobody ever waits for anybody.
 
-Each record has one writer and any number of readers. The writer makes a record's number odd, writes, and makes it even
-again; a reader that met a write half done reads once more.
+Each record has one writer and any number of readers.
 """
 
 from __future__ import annotations
 
-import time
 from multiprocessing.shared_memory import SharedMemory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
+
+from robotcell.shared_record import SharedRecord, record_size
 
 if TYPE_CHECKING:
     from robotcell.geometry import Array
@@ -58,13 +57,9 @@ class Record:
     """
 
     def __init__(self, dtype: np.dtype[Any], name: str | None = None) -> None:
-        self._memory = SharedMemory(name=name, create=name is None, size=8 + dtype.itemsize)
+        self._memory = SharedMemory(name=name, create=name is None, size=record_size(dtype))
         self._owner = name is None
-        self._number: npt.NDArray[np.uint64] = np.ndarray((1,), np.uint64, self._memory.buf)
-        self._data: npt.NDArray[np.void] = np.ndarray((1,), dtype, self._memory.buf, offset=8)
-        if self._owner:
-            self._number[0] = 0
-            self._data[...] = np.zeros(1, dtype)
+        self._record: SharedRecord | None = SharedRecord(dtype, self._memory.buf)  # type: ignore[arg-type]
 
     @property
     def name(self) -> str:
@@ -74,31 +69,26 @@ class Record:
     @property
     def written(self) -> bool:
         """Whether anything was ever written."""
-        return bool(self._number[0] >= 2)
+        return self._open().written
 
     def write(self, **fields: float | Array) -> None:
         """Set some fields; the others keep their values."""
-        self._number[0] += 1
-        for key, value in fields.items():
-            self._data[key][0] = value
-        self._number[0] += 1
+        self._open().write(**fields)
 
     def read(self) -> np.void:
         """A copy of the record."""
-        while True:
-            before = int(self._number[0])
-            if before % 2 == 0:
-                copy = self._data.copy()
-                if int(self._number[0]) == before:
-                    return copy[0]  # type: ignore[no-any-return]
-            time.sleep(0)
+        return self._open().read()
 
     def close(self) -> None:
         """Let the memory go; its maker removes it. Idempotent."""
-        # The arrays hold on to the buffer.
-        self._number = np.empty(0, np.uint64)
-        self._data = np.empty(0, self._data.dtype)
+        # The record holds on to the buffer.
+        self._record = None
         self._memory.close()
         if self._owner:
             self._owner = False
             self._memory.unlink()
+
+    def _open(self) -> SharedRecord:
+        if self._record is None:
+            raise ValueError(f"the record {self._memory.name} is closed")
+        return self._record
