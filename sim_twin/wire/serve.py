@@ -6,6 +6,7 @@ import contextlib
 import ipaddress
 import multiprocessing
 import os
+import signal
 import socket
 import sys
 import threading
@@ -229,7 +230,7 @@ class ServedCell:
         faults, faults_out = context.Pipe(duplex=False)
         ready_in, ready = context.Pipe(duplex=False)
         process = context.Process(target=entry, args=(*arguments, faults, ready), name=f"robotcell twin {name}")
-        # An interrupt at the terminal reaches the whole group; it is for the supervisor alone, from the first moment on.
+        # An interrupt at the terminal reaches the whole group; it is for the supervisor alone, from the first moment.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             process.start()
