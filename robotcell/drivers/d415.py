@@ -140,11 +140,14 @@ class D415(Camera):
         with sdk_errors("emptying the queue of frames"):
             self._pipeline.poll_for_frames()
         deadline = called + _FRAME_S * self._options.temporal_frames
-        problem: CellError = ConnectionLost(f"camera: no frame came within {_FRAME_S:g} s; {USB_ADVICE}")
+        silence = ConnectionLost(f"camera: no frame came within {_FRAME_S:g} s; {USB_ADVICE}")
+        problem: CellError = silence
         framesets: list[Any] = []
         while (left := deadline - self._clock.now()) > 0:
             frameset = self._wait(left)
             if frameset is None:
+                # After a last frame that was of no use the stream has ended.
+                problem = silence if left > _FRAME_S / 2 else problem
                 break
             try:
                 t, number = self._check(frameset, called)

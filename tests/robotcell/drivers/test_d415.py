@@ -20,6 +20,12 @@ WALL = np.full((480, 640), 900, np.uint16)
 FOCAL_PX = 617.3
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """The exposure of these cameras has nothing to settle."""
+    monkeypatch.setattr(d415, "_WARM_UP_FRAMES", 3)
+
+
 @pytest.fixture
 def fed(monkeypatch):
     """Makes devices; the driver finds the newest one as fed://."""
