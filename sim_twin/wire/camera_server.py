@@ -7,7 +7,6 @@ could not be made in time leaves a gap, as one that a device dropped does. Nothi
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import signal
 import socket
@@ -19,13 +18,12 @@ from typing import TYPE_CHECKING
 
 from robotcell.errors import CellError, ConfigError
 from sim_twin.backend import TwinOptions
-from sim_twin.noise import DEPTH_UNIT_M
 from sim_twin.raycast import load_open3d
 from sim_twin.renderer import FRAMES_PER_S, MODES, Renderer
 from sim_twin.wire.camera_clients import Client
 from sim_twin.wire.camera_images import IMAGE_FAULTS, ImageMaker
 from sim_twin.wire.faults import FaultInbox, Kind
-from sim_twin.wire.frames import Description, encode
+from sim_twin.wire.frames import SERIAL, Description, describe, encode
 from sim_twin.wire.shared import Record, poses_dtype
 
 if TYPE_CHECKING:
@@ -34,10 +32,7 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from sim_twin.world import Visual
 
-SERIAL = "000000000415"
 WRONG_SERIAL = "999999999999"
-# Of 2023 and later SDKs for the D415.
-_FIRMWARE = "5.15.1.55"
 
 FAULTS: frozenset[tuple[str, Kind, str]] = IMAGE_FAULTS | {
     ("stream", Kind.OFF, ""),  # the port is closed
@@ -200,13 +195,13 @@ class CameraServer:
         self.port = int(self._listener.getsockname()[1])
 
     def _unplug(self) -> None:
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
         clients, self._clients = self._clients, []
         for client in clients:
             client.close()
         self._streams = {}
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
 
     def _serve_clients(self, turn: int) -> None:
         for client in [client for client in self._clients if client.gone]:
@@ -238,20 +233,12 @@ class CameraServer:
 
     def _renderer(self, mode: str) -> Renderer:
         mount = self._mount.model_copy(update={"resolution": mode})
-        return Renderer(self._visuals, mount, self._options.noise, self._options.seed)
+        T_base_camera = self._options.camera_pose(mount)
+        return Renderer(self._visuals, mount, self._options.noise, self._options.seed, T_base_camera)
 
     def _describe(self, mode: str) -> Description:
         wrong_serial, _, usb2 = self._replug
-        optics = MODES[mode]
-        return Description(
-            name="Intel RealSense D415",
-            serial=WRONG_SERIAL if wrong_serial else SERIAL,
-            firmware=_FIRMWARE,
-            usb_type="2.1" if usb2 else "3.2",
-            frames_per_s=FRAMES_PER_S,
-            depth_unit_m=DEPTH_UNIT_M,
-            **dataclasses.asdict(optics),
-        )
+        return describe(MODES[mode], WRONG_SERIAL if wrong_serial else SERIAL, "2.1" if usb2 else "3.2")
 
 
 class _Stream:
