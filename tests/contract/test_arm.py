@@ -96,7 +96,11 @@ def test_linear_motion_keeps_to_the_line_and_its_speed(cell: Cell) -> None:
     steps = np.array([state.T_base_tcp[:3, 3] for state in states]) - T_start[:3, 3]
     times = np.array([state.t for state in states])
     assert np.linalg.norm(np.cross(steps, along / length), axis=1).max() < 0.001
-    assert (np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.diff(times)).max() < 0.1 * 1.2
+    # Over a fifth of a second: a device measures less often than it reports.
+    later = np.searchsorted(times, times + 0.2)
+    whole = later < len(times)
+    ways = np.linalg.norm(steps[later[whole]] - steps[whole], axis=1)
+    assert (ways / (times[later[whole]] - times[whole])).max() < 0.1 * 1.2
     T_reached = cell.arm.state().T_base_tcp
     assert np.abs(T_reached[:3, 3] - T_end[:3, 3]).max() < 0.001
     assert rotation_angle(T_reached[:3, :3], T_end[:3, :3]) < 0.005
