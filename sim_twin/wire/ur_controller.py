@@ -346,6 +346,9 @@ class Controller:
         if self.time - self._stopped_at < UNLOCK_AFTER_S:
             return False
         self.safety_mode = SafetyMode.NORMAL
+        # Somebody may have moved the arm meanwhile.
+        self.arm.hold()
+        self._targets[:] = self.arm.q
         self._force_limit_n = max(PROTECTIVE_FORCE_N, self._force_n + _LEAVING_FORCE_N)
         return True
 
