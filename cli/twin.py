@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
-import time
+import threading
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,20 +21,21 @@ from sim_twin.wire.serve import ServedCell, is_loopback
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from types import FrameType
-    from typing import NoReturn
 
 # What each endpoint is for.
 _USES = {
     "rtde": ("UR5e", "RTDE: state, and motion by ur_rtde"),
     "dashboard": ("UR5e", "dashboard: power, brakes, stops, programs"),
-    "script": ("UR5e", "URScript programs"),
+    "script": ("UR5e", "URScript programs, and the realtime state stream"),
     "primary": ("UR5e", "primary interface: state stream"),
     "secondary": ("UR5e", "secondary interface: state stream"),
+    "primary read-only": ("UR5e", "primary interface, no programs"),
+    "secondary read-only": ("UR5e", "secondary interface, no programs"),
+    "realtime read-only": ("UR5e", "realtime state stream, no programs"),
     "modbus": ("RG2", "Modbus TCP of the Compute Box, unit 65; one client at a time"),
     "camera": ("D415", 'frames; camera.source = "twin://{}"'),
     "control": ("cell", "control socket: faults, JSON lines; robotcell twin fault"),
 }
-_TICK_S = 0.002
 _STATUS_S = 1.0
 
 
@@ -63,8 +64,7 @@ def run_serve(
             )
         config = as_twin(cell_file, options)
         served = ServedCell(config, host, **{name: port for name, port in ports.items() if port is not None})
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, _end)
+        ended = _signalled()
         with progress().status("building the cell and starting its servers"):
             served.start()
         with served:
@@ -77,11 +77,10 @@ def run_serve(
                     )
                 )
             _print_endpoints(served.endpoints)
-            _watch(served)
-    except KeyboardInterrupt:
-        return 0
+            _watch(served, ended)
     except CellError as error:
         return report_error(error)
+    return 0
 
 
 def run_fault(words: list[str], value: float | None, control: str, *, clear: bool, show: bool) -> int:
@@ -109,13 +108,6 @@ def run_fault(words: list[str], value: float | None, control: str, *, clear: boo
     return 0
 
 
-def _end(_number: int, _frame: FrameType | None) -> NoReturn:
-    # The second of two impatient signals must not cut the end short.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    raise KeyboardInterrupt
-
-
 def as_twin(cell_file: Path | None, options: Mapping[str, Any]) -> CellConfig:
     """The cell with the twin for its backend, whatever it was."""
     backend = load_config(cell_file).backend
@@ -123,22 +115,35 @@ def as_twin(cell_file: Path | None, options: Mapping[str, Any]) -> CellConfig:
     return load_config(cell_file, {"backend.name": "twin", "backend.options": {**own, **options}})
 
 
+def _signalled() -> threading.Event:
+    """What SIGINT and SIGTERM set from now on; once it is set, a further one interrupts at once."""
+    ended = threading.Event()
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        if ended.is_set():
+            raise KeyboardInterrupt
+        ended.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    return ended
+
+
 def _print_endpoints(endpoints: Mapping[str, str]) -> None:
     table = Table("device", "what", "address", box=None, pad_edge=False)
     for name, address in endpoints.items():
-        device, what = _USES.get(name, ("", name))
+        device, what = _USES[name]
         table.add_row(device, Text(what.format(address)), address)
     results().print(table)
 
 
-def _watch(served: ServedCell) -> NoReturn:
-    """Show how it goes, until a signal comes or a server dies."""
+def _watch(served: ServedCell, ended: threading.Event) -> None:
+    """Show how it goes, until it is to end or a server dies."""
     console = progress()
     before = None
     status = console.status("serving; Ctrl-C ends it", refresh_per_second=2)
     with status if console.is_terminal else nullcontext() as line:
-        while True:
-            time.sleep(_STATUS_S)
+        while not ended.wait(_STATUS_S):
             if served.ended:
                 raise ConnectionLost(f"the twin's process {' and '.join(served.ended)} has died: start it again")
             if line is not None:

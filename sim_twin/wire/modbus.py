@@ -110,6 +110,8 @@ def _execute(request: bytes, unit: int, units: Units) -> bytes:
         return request[:5]
     if function == 23:
         read_address, read_count, address, count, _ = _unpack(">HHHHB", body[:9])
+        # Nothing is written when nothing can be read.
+        _read(unit, read_address, read_count, units)
         units.write(unit, address, _values(body[8:], count, _MAX_READ_WRITE))
         return bytes([function]) + _read(unit, read_address, read_count, units)
     raise RefusedError(Refusal.FUNCTION)

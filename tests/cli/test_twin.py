@@ -108,6 +108,24 @@ def test_an_interrupt_ends_it_clean():
     assert not [server for server in serving.servers if lives(server)]
 
 
+def test_an_interrupt_while_it_starts_ends_it_clean_too():
+    command = [*COMMAND, "serve", "--host", "127.0.0.22", "--objects", "1", *PORTS]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        children: list[psutil.Process] = []
+        end = time.monotonic() + LIMIT_S
+        # The first of them keeps the shared memory.
+        while len(children) < 3 and time.monotonic() < end:
+            children = psutil.Process(process.pid).children()
+            time.sleep(0.01)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=LIMIT_S)
+        assert errors == ""
+    assert process.returncode == 0
+    assert not [child for child in children if lives(child.pid)]
+
+
 def test_refuses_to_be_reached_by_others_unless_told():
     code, output = run("serve", "--host", "0.0.0.0")
     assert code == 2

@@ -99,5 +99,11 @@ def test_answers_as_the_standard_says(pdu, response):
     assert answer(frame(pdu), Ten())[7:] == response
 
 
+def test_a_write_and_read_that_cannot_read_does_not_write():
+    units = Ten()
+    assert answer(frame(struct.pack(">BHHHHBH", 23, 9, 2, 1, 1, 2, 77)), units)[7:] == bytes([0x97, 2])
+    assert units.registers == list(range(10))
+
+
 def test_an_unknown_unit_meets_silence():
     assert answer(frame(struct.pack(">BHH", 3, 0, 1), unit=66), Ten()) is None
