@@ -19,15 +19,6 @@ SIZE = 72
 BOTH = pytest.mark.parametrize(("primitive", "rotations"), [(GRASP, 8), (PUSH, 16)])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    # On maps this small, a second thread costs more than it gives.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
 def network():
     with torch.random.fork_rng():

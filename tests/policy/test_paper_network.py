@@ -6,15 +6,6 @@ from policy.networks import make_network
 from policy.paper_network import PaperNetwork
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    # On maps this small, a second thread costs more than it gives.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @pytest.fixture(scope="module")
 def network():
     with torch.random.fork_rng():

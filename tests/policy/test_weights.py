@@ -18,15 +18,6 @@ from robotcell.errors import ConfigError
 CARD = {"training": json.dumps({"steps": 5000, "lr": 1e-3}), "evaluation": json.dumps({"grasp": 0.94})}
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    # On tensors this small, a second thread costs more than it gives.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 @functools.cache
 def trained(architecture="fast", seed=0):
     """A network with norm statistics that are not those of a fresh one."""

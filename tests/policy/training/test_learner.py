@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -18,22 +17,15 @@ from policy.training.replay import Replay, View
 from policy.training.shard import Shard
 from tests.policy.training import toy
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 SIZE = 64
 HEIGHT, RED, GREEN, BLUE = 0, 2, 3, 4
 TRAINING, VALIDATION = 1, 16
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums in a fixed order, and torch's own random numbers."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def torch_draws() -> None:
+    """The same random numbers of torch in every test."""
     torch.manual_seed(0)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

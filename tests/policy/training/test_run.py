@@ -21,7 +21,7 @@ from robotcell.errors import ConfigError
 from tests.policy.training import toy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
 STAGE = StageSettings(
     rounds=3, scenes_per_round=6, updates_per_round=5, warmup_rounds=1, exploration_start=0.5, exploration_end=0.1
@@ -50,15 +50,6 @@ def say(what, done, total):
 run = Path(sys.argv[1])
 train(load_train_config(run / "stage1" / "train.toml"), 1, run, workers=1, collect=toy.collect, on_progress=say)
 """
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Sums in a fixed order."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def run_stage(run: Path, stage: int = 1, config: TrainConfig | None = CONFIG, **settings: Any) -> TrainConfig:
