@@ -13,7 +13,7 @@ from pymodbus.client import ModbusTcpClient
 from typer.testing import CliRunner
 
 from cli.main import app
-from tests.processes import lives
+from tests.processes import all_end
 
 LIMIT_S = 60.0
 COMMAND = [sys.executable, "-c", "from cli.main import main; main()", "twin"]
@@ -51,7 +51,7 @@ def serving():
     serving = Serving("127.0.0.29")
     yield serving
     assert serving.end(signal.SIGTERM) == (0, "")
-    assert not [server for server in serving.servers if lives(server)]
+    assert all_end(serving.servers)
 
 
 def run(*words):
@@ -105,7 +105,7 @@ def test_no_control_socket(control, code):
 def test_an_interrupt_ends_it_clean():
     serving = Serving("127.0.0.22")
     assert serving.end(signal.SIGINT) == (0, "")
-    assert not [server for server in serving.servers if lives(server)]
+    assert all_end(serving.servers)
 
 
 def test_an_interrupt_while_it_starts_ends_it_clean_too():
@@ -123,7 +123,7 @@ def test_an_interrupt_while_it_starts_ends_it_clean_too():
         _, errors = process.communicate(timeout=LIMIT_S)
         assert errors == ""
     assert process.returncode == 0
-    assert not [child for child in children if lives(child.pid)]
+    assert all_end(child.pid for child in children)
 
 
 def test_refuses_to_be_reached_by_others_unless_told():

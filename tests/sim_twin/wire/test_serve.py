@@ -14,7 +14,7 @@ from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.faults import Fault, Kind
 from sim_twin.wire.serve import ServedCell, is_loopback
-from tests.processes import lives
+from tests.processes import all_end
 
 HOST = "127.0.0.23"
 ONE = load_config(None, {"backend.options.objects": 1})
@@ -179,7 +179,4 @@ def test_no_server_outlives_a_supervisor_that_was_killed(tmp_path):
         pids = [int(pid) for pid in supervisor.stdout.readline().split()]
         assert len(pids) == 4
         supervisor.kill()
-    end = time.monotonic() + LIMIT_S
-    while any(lives(pid) for pid in pids):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    assert all_end(pids)
