@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ from calibration.handeye import FLOOR, Fit, Noise, arm_noise, pose_noise, predic
 from calibration.mistakes import find_mistake, find_partial_shift
 from calibration.projection import CornerStack, intrinsics_vector, project, stack_corners
 from calibration.rigid import change, difference
+from calibration.series import Series, align
 from calibration.solution import Estimate, Solution, ViewErrors
 from calibration.verdict import (
     MAX_HELD_OUT_DEG,
@@ -36,14 +38,15 @@ from calibration.verdict import (
     refuse,
     rotation_spread_deg,
 )
+from calibration.views import Views
+from robotcell.errors import CalibrationError
 from robotcell.geometry import make_transform
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
     from calibration.depth import DepthFit
-    from calibration.views import Views
-    from robotcell.camera_calibration import CameraModel
+    from robotcell.camera_calibration import CameraModel, Mount
     from robotcell.geometry import Array
 
 # Outliers are found again with the noise's shapes at the first result.
@@ -87,6 +90,23 @@ def solve(views: Views, *, refine_intrinsics: bool = False) -> Solution:
     for i, error in zip(index, errors, strict=True):
         all_errors[i] = error
     return Solution(views, verdict, tuple(all_errors), estimate, tuple(spread.tolist()))
+
+
+def solve_series(flange: Series, board: Series, mount: Mount) -> Solution:
+    """Solve two time series with clocks of their own; what cannot be aligned is refused.
+
+    Args:
+        flange: T_base_flange.
+        board: T_camera_board.
+        mount: where the camera is.
+    """
+    now = datetime.now(timezone.utc)
+    try:
+        views = align(flange, board, mount, now)
+    except CalibrationError as error:
+        none = Views(mount, (), np.empty((0, 4, 4)), now, np.empty((0, 4, 4)))
+        return Solution(none, refuse(Reason.CLOCKS, str(error)), ())
+    return solve(views)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from cli.calibrate import app as calibrate_app
+
 if TYPE_CHECKING:
     from types import FrameType
 
@@ -30,6 +32,7 @@ twin_app = typer.Typer(
     help="The simulated cell behind the devices' own protocols.", no_args_is_help=True, pretty_exceptions_enable=False
 )
 app.add_typer(twin_app, name="twin")
+app.add_typer(calibrate_app, name="calibrate")
 
 CellFile = Annotated[
     Path | None, typer.Option("--cell", help="The cell's TOML file; without one, the twin with its defaults.")
