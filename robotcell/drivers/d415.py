@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from robotcell.drivers.d415_images import D415Images
 from robotcell.drivers.realsense import USB_ADVICE, check_usb, find_device, load_pyrealsense2, sdk_errors, serial_number
-from robotcell.errors import CellError, ConfigError, ConnectionLost, DeviceFault
+from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Camera, RgbdFrame
 
 if TYPE_CHECKING:
@@ -140,14 +140,15 @@ class D415(Camera):
         with sdk_errors("emptying the queue of frames"):
             self._pipeline.poll_for_frames()
         deadline = called + _FRAME_S * self._options.temporal_frames
-        silence = ConnectionLost(f"camera: no frame came within {_FRAME_S:g} s; {USB_ADVICE}")
-        problem: CellError = silence
+        # Kept as words: an error would keep the frames that it came from, of which librealsense has only a few.
+        silence = f"camera: no frame came within {_FRAME_S:g} s; {USB_ADVICE}"
+        problem = ""
         framesets: list[Any] = []
         while (left := deadline - self._clock.now()) > 0:
             frameset = self._wait(left)
             if frameset is None:
                 # After a last frame that was of no use the stream has ended.
-                problem = silence if left > _FRAME_S / 2 else problem
+                problem = "" if left > _FRAME_S / 2 else problem
                 break
             try:
                 t, number = self._check(frameset, called)
@@ -158,8 +159,8 @@ class D415(Camera):
                     _check_images(color, depth_m)
                     return RgbdFrame(t, number, color, depth_m, self._images.intrinsics, self._serial)
             except DeviceFault as fault:
-                problem = fault
-        raise problem
+                problem = str(fault)
+        raise DeviceFault(problem) if problem else ConnectionLost(silence)
 
     def _connect(self) -> None:
         rs = load_pyrealsense2()

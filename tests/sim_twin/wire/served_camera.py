@@ -34,15 +34,20 @@ class ServedCamera:
         host: where it listens.
         port: likewise; 0 for any.
         overrides: of the cell, by dotted key.
+        scene: what it looks at, instead of boxes.
     """
 
-    def __init__(self, host: str, port: int = 0, overrides: dict[str, object] | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        port: int = 0,
+        overrides: dict[str, object] | None = None,
+        scene: tuple[tuple[Visual, ...], np.ndarray] | None = None,
+    ) -> None:
         self.config = load_config(None, overrides)
         self.host = host
         self.port = port
-        world = table_with_blocks()
-        self.visuals = tuple(Visual(box.vertices, box.triangles, box.color, "object") for box in world.boxes)
-        self.poses = world.poses
+        self.visuals, self.poses = scene or _boxes()
         self.process: BaseProcess
         self._faults: Connection
 
@@ -100,6 +105,11 @@ class ServedCamera:
         self.poses = self.poses.copy()
         self.poses[index, :3, 3] += by
         self._record.write(poses=self.poses)
+
+
+def _boxes() -> tuple[tuple[Visual, ...], np.ndarray]:
+    world = table_with_blocks()
+    return tuple(Visual(box.vertices, box.triangles, box.color, "object") for box in world.boxes), world.poses
 
 
 class RawClient:
