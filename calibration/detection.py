@@ -23,6 +23,7 @@ MIN_CORNERS = 8
 _MIN_LINES = 3
 # A corner nearer to the border of the image was refined in a window that is cut off [px].
 _BORDER_PX = 6
+_NOT_FOUND = "the board was not found"
 
 
 @dataclass(frozen=True)
@@ -54,15 +55,19 @@ class Detector:
         gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
         found_px, found_ids, _, _ = self._detector.detectBoard(gray)
         if found_ids is None or found_px is None:
-            return Detection(Corners(np.zeros(0, np.int64), np.zeros((0, 2))), "the board was not found")
+            return Detection(Corners(np.zeros(0, np.int64), np.zeros((0, 2))), _NOT_FOUND)
         ids = np.asarray(found_ids, np.int64).ravel()
         px = np.asarray(found_px, np.float64).reshape(-1, 2)
         height, width = gray.shape
         inside = ((px >= _BORDER_PX) & (px <= (width - 1 - _BORDER_PX, height - 1 - _BORDER_PX))).all(axis=1)
-        ids, px = ids[inside], px[inside]
-        return Detection(Corners(ids, px), self._refuse(ids))
+        corners = Corners(ids[inside], px[inside])
+        return Detection(corners, self.refuse(corners))
 
-    def _refuse(self, ids: npt.NDArray[np.int64]) -> str:
+    def refuse(self, corners: Corners) -> str:
+        """Why these corners are of no use; "" if they are."""
+        ids = corners.ids
+        if not len(ids):
+            return _NOT_FOUND
         if len(ids) < MIN_CORNERS:
             return f"{len(ids)} corners of the board are seen, and {MIN_CORNERS} are needed"
         columns = self._board.squares_x - 1

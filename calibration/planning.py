@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from robotcell.camera_calibration import CharucoBoard
     from robotcell.config import CellConfig
     from robotcell.interfaces import Intrinsics
+    from robotcell.safety import CheckedPlan
 
 # Beyond this, corners of a printed board get uncertain and its depth is lost to reflections.
 MAX_TILT_RAD = np.radians(45)
@@ -135,7 +136,7 @@ def plan_views(
 
 def plan_ways(
     label: str, q_start: Array, q: Array, hub: Array, held: HeldBoard, config: CellConfig
-) -> list[MotionPlan]:
+) -> list[CheckedPlan]:
     """The motions to joint angles (6,): straight there, or else through the hub.
 
     Raises:
@@ -148,7 +149,7 @@ def plan_ways(
         return [to_hub, plan_way(label, hub, q, held, config)]
 
 
-def plan_way(label: str, q_start: Array, q: Array, held: HeldBoard, config: CellConfig) -> MotionPlan:
+def plan_way(label: str, q_start: Array, q: Array, held: HeldBoard, config: CellConfig) -> CheckedPlan:
     """A joint-space motion with the board in the gripper, checked for arm, gripper and board.
 
     Raises:
@@ -156,12 +157,12 @@ def plan_way(label: str, q_start: Array, q: Array, held: HeldBoard, config: Cell
     """
     speed = min(_JOINT_SPEED_RAD_S, config.motion.joint_speed_rad_s)
     move = JointMove(label, q, speed, config.motion.joint_acceleration_rad_s2)
-    plan = check_plan(MotionPlan(label, q_start, (move,)), config).plan
+    checked = check_plan(MotionPlan(label, q_start, (move,)), config)
     steps = max(2, int(np.ceil(np.abs(q - q_start).max() / _PATH_STEP_RAD)) + 1)
     path = q_start + np.linspace(0.0, 1.0, steps)[:, None] * (q - q_start)
     # Where the arm stands now is a fact: only where it goes is checked.
     _check_board(path[1:], held, config, label)
-    return plan
+    return checked
 
 
 def visible(T_camera_board: Array, held: HeldBoard, intrinsics: Intrinsics) -> bool:

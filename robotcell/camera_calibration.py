@@ -24,6 +24,7 @@ VERSION = 1
 # A camera on a post moves when somebody leans on it; half a year is about how long nobody remembers.
 MAX_AGE = timedelta(days=180)
 
+_Row2: TypeAlias = tuple[float, float]
 _Row4: TypeAlias = tuple[float, float, float, float]
 _Row6: TypeAlias = tuple[float, float, float, float, float, float]
 
@@ -164,6 +165,18 @@ class DepthCorrection(_Record):
     offset_m: float
 
 
+class FixedTag(_Record):
+    """A tag of the AprilTag family 36h11 that is fixed to the cell, as a fixed camera sees it (`robotcell.drift`).
+
+    Attributes:
+        id: of the tag.
+        corners_px: its corners in the image [px].
+    """
+
+    id: Annotated[int, Field(ge=0, le=586)]
+    corners_px: tuple[_Row2, _Row2, _Row2, _Row2]
+
+
 class CameraCalibration(_Record):
     """What a calibration found.
 
@@ -185,6 +198,7 @@ class CameraCalibration(_Record):
         rejected: names of the views that were left out.
         held_out: errors of held-out views.
         depth: correction of the depth image; None without depth samples.
+        tags: fixed tags that were in view, to see later whether the camera was moved.
         method: closed form that gave the start, and what refined it.
         software: that wrote the file.
     """
@@ -207,6 +221,7 @@ class CameraCalibration(_Record):
     rejected: tuple[str, ...] = ()
     held_out: HeldOutErrors
     depth: DepthCorrection | None = None
+    tags: tuple[FixedTag, ...] = ()
     method: str
     software: str
 

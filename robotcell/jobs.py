@@ -15,6 +15,7 @@ import numpy as np
 
 from robotcell.collision import blocks_view
 from robotcell.decision import Action, Observation, Policy, Primitive
+from robotcell.drift import check_tags
 from robotcell.errors import CalibrationError, CellError, ConfigError, DeviceFault, NoTarget, UnsafeMotion
 from robotcell.executor import Ending, Execution, Executor
 from robotcell.heightmap import Heightmap, build_heightmap, close_gaps
@@ -136,7 +137,7 @@ def look(cell: Cell) -> View:
 
     Raises:
         ConnectionLost, DeviceFault: the camera delivers nothing, or a stale or sparse frame.
-        CalibrationError: the table is not where the configuration has it.
+        CalibrationError: the table is not where the configuration has it, or a fixed tag not where it was.
     """
     config, limits = cell.config, cell.config.limits
     if blocks_view(cell.arm.state().q, config):
@@ -145,6 +146,8 @@ def look(cell: Cell) -> View:
     age = cell.clock.now() - frame.t
     if age > limits.frame_age_s:
         raise DeviceFault(f"frame {frame.number} is {age:.2f} s old (limit {limits.frame_age_s} s): check the camera")
+    if config.camera.measured is not None:
+        check_tags(frame.color, config.camera.measured.tags)
     heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
     # Without the gaps between pixels, which say something of the resolution and nothing of the view.
     coverage = float(np.isfinite(close_gaps(heightmap.height_m)).mean())

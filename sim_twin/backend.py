@@ -27,6 +27,7 @@ class TwinOptions(BaseModel):
         meshes: folder of the OBJ files that a scene file names.
         noise: what the camera adds to the truth.
         board: the gripper holds the calibration board (docs/calibration.md), a little differently for each seed.
+        tag: a tag lies on the table beside the workspace, as one that is fixed to a cell (robotcell/drift.py).
         camera_offset: how far the camera really stands from where `camera` has it without a calibration: position [m]
             and rotation vector [rad], base axes. A camera that was moved, or never measured.
     """
@@ -39,6 +40,7 @@ class TwinOptions(BaseModel):
     meshes: Path | None = None
     noise: NoiseOptions = NoiseOptions()
     board: bool = False
+    tag: bool = False
     camera_offset: tuple[float, float, float, float, float, float] = (0.0,) * 6
 
     def camera_pose(self, mount: CameraMount) -> Array:

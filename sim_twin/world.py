@@ -584,6 +584,10 @@ class World:
         entries: list[tuple[Visual, tuple[str, int]]] = []
         for kind, part in furniture(self.config, self._options.camera_pose(self.config.camera)):
             entries.append((_part_visual((part,), kind), ("fixed", 0)))
+        if self._options.tag:
+            from sim_twin.fixed_tag import tag_visual
+
+            entries.append((tag_visual(self.config), ("fixed", 0)))
         entries += self._robot_visuals()
         for i, item in enumerate(built.scene_objects):
             mesh = item.shape.mesh
