@@ -226,6 +226,7 @@ class _Server:
         if connection is None:
             return
         client = Client(connection, self._session(port))
+        client.outbox.delay_s = self._delay_s(port)
         port.clients.append(client)
         if port is self._dashboard:
             self._put(port, client, GREETING)
@@ -261,10 +262,9 @@ class _Server:
         if changed:
             self._state_faults.apply(self._inbox)
             self._present = frozenset(fault for fault in FAULTS if self._inbox.find(*fault))
-            for port, channel in ((self._rtde, "rtde"), (self._dashboard, "dashboard")):
-                delay = self._inbox.find(channel, Kind.DELAYED)
+            for port in self._ports:
                 for client in port.clients:
-                    client.outbox.delay_s = delay.value or 0.0 if delay else 0.0
+                    client.outbox.delay_s = self._delay_s(port)
 
     # Sending
 
@@ -334,6 +334,10 @@ class _Server:
 
     def _stuck(self, port: Port) -> bool:
         return self._has(port.name, Kind.STUCK)
+
+    def _delay_s(self, port: Port) -> float:
+        fault = self._inbox.find(port.name, Kind.DELAYED)
+        return 0.0 if fault is None else max(fault.value or 0.0, 0.0)
 
     def _follow_fault(self, port: Port) -> None:
         """Close a port that is to be off, with its clients; open it again when that is over."""

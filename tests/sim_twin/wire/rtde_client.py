@@ -34,6 +34,9 @@ class RtdeClient:
     def close(self) -> None:
         self._socket.close()
 
+    def settimeout(self, timeout: float) -> None:
+        self._socket.settimeout(timeout)
+
     def send(self, kind: str, payload: bytes = b"") -> None:
         self._socket.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
 
