@@ -15,9 +15,9 @@ import numpy.typing as npt
 from calibration.closed_form import shah_rotations, translations
 from robotcell.geometry import Array, make_transform
 
-# Four views leave no freedom that noise could fill; of 300 draws from views of which 40 % are wrong, 38 are clean.
+# Four views leave no freedom that noise could fill; of 150 draws from views of which 40 % are wrong, 19 are clean.
 _SUBSET = 4
-_SUBSETS = 300
+_SUBSETS = 150
 _CONCENTRATIONS = 8
 _SHARE = 0.6
 # A turn counts as the distance that it moves a point this share of the way between camera and board.

@@ -28,7 +28,8 @@ OUTLIER = float(np.sqrt(chi2.ppf(1 - 1e-4, 6)))
 # Standard deviations are not estimated below a micrometre and a microradian: nothing mechanical is.
 FLOOR = 1e-6
 _MAX_ITERATIONS = 100
-_CONVERGED = 1e-9
+_CONVERGED = 1e-7
+_CONVERGED_WEIGHTS = 1e-3
 _MAX_REJECTIONS = 20
 # Median and mean square of the length of three standard normal numbers (chi with three degrees of freedom).
 _CHI3_MEDIAN = float(np.sqrt(chi2.ppf(0.5, 3)))
@@ -154,19 +155,20 @@ def refine(
         free_scale: estimate it.
     """
     variances = np.maximum(_first_variances(predict(X, Z, M), _scaled(C, scale), noise, used), noise.floors)
+    A = np.zeros((13 if free_scale else 12,) * 2)
     for _ in range(_MAX_ITERATIONS):
         e, J = _linearise(X, Z, M, C, scale, free_scale)
         W = np.linalg.inv(np.einsum("k,kvij->vij", variances, noise.shapes))
         weight = _huber(np.sqrt(np.einsum("vi,vij,vj->v", e, W, e))) * used
-        JW = np.einsum("v,vip,vij->vpj", weight, J, W)
-        A = np.einsum("vpj,vjq->pq", JW, J)
-        step = _solve(A, np.einsum("vpj,vj->p", JW, e))
+        WJ = weight[:, None, None] * (W @ J)
+        before, A = A, np.tensordot(J, WJ, axes=([0, 1], [0, 1]))
+        step = _solve(A, np.tensordot(WJ, e, axes=([0, 1], [0, 1])))
         X, Z = change(X, step[:6]), change(Z, step[6:12])
         if free_scale:
             scale += step[12]
-        before = variances
         variances = np.maximum(_next_variances(variances, e, J, W, A, weight, noise), noise.floors)
-        if np.abs(step).max() < _CONVERGED and np.abs(variances / before - 1).max() < 1e-3:
+        # The variances matter through the weights alone: one that fades away need not reach its end.
+        if np.abs(step).max() < _CONVERGED and np.allclose(np.diag(A), np.diag(before), rtol=_CONVERGED_WEIGHTS):
             break
     return _leave_one_out(X, Z, M, C, scale, free_scale, variances, noise, used)
 
@@ -224,15 +226,12 @@ def _first_variances(C_predicted: Array, C: Array, noise: Noise, used: npt.NDArr
 
 def _next_variances(variances: Array, e: Array, J: Array, W: Array, A: Array, weight: Array, noise: Noise) -> Array:
     """One step of the fixed point of restricted maximum likelihood (Harville 1977): e'PGPe / trace(PG) tends to one."""
-    We = np.einsum("vij,vj->vi", W, e)
+    We = (W @ e[..., None])[..., 0]
     quadratic = np.einsum("v,vi,kvij,vj->k", weight, We, noise.shapes, We)
     taking_part = (weight > 0).astype(np.float64)
-    GW = noise.shapes @ W
     WJ = W @ J
-    lost = np.linalg.pinv(A, hermitian=True)
-    trace = np.einsum("v,kvii->k", taking_part, GW) - np.einsum(
-        "v,vip,kvij,vjq,qp->k", weight, WJ, noise.shapes, WJ, lost, optimize=True
-    )
+    lost = (noise.shapes @ WJ) * (weight[:, None, None] * WJ @ np.linalg.pinv(A, hermitian=True))
+    trace = ((noise.shapes * W).sum(axis=(2, 3)) * taking_part).sum(axis=1) - lost.sum(axis=(1, 2, 3))
     return np.asarray(variances * quadratic / np.maximum(trace, 1e-12))
 
 
@@ -259,11 +258,10 @@ def _leave_one_out(
     S = np.einsum("k,kvij->vij", variances, noise.shapes)
     W = np.linalg.inv(S)
     weight = _huber(np.sqrt(np.einsum("vi,vij,vj->v", e, W, e))) * used
-    JW = np.einsum("v,vip,vij->vpj", weight, J, W)
+    JW = np.swapaxes(weight[:, None, None] * (W @ J), 1, 2)
     shares = JW @ J
-    A = shares.sum(axis=0)
-    gradients = np.einsum("vpj,vj->vp", JW, e)
-    without = A - shares
+    gradients = (JW @ e[..., None])[..., 0]
+    without = shares.sum(axis=0) - shares
     steps = _solve(without, gradients.sum(axis=0) - gradients)
     held_X = change(np.broadcast_to(X, (len(M), 4, 4)), steps[:, :6])
     held_Z = change(np.broadcast_to(Z, (len(M), 4, 4)), steps[:, 6:12])
@@ -284,18 +282,13 @@ def _covariance(J: Array, W: Array, weight: Array, shapes: Array) -> tuple[Array
         shapes: (K, V, 6, 6) of the noise.
     """
     WJ = weight[:, None, None] * (W @ J)
-    simple = np.linalg.pinv(np.einsum("vip,vij,vjq,v->pq", J, W, J, weight, optimize=True), hermitian=True)
-    GWJ = shapes @ WJ
-    P = np.einsum("vip,kvij,vjq->kpq", WJ, shapes, WJ, optimize=True)
     weighted = weight[:, None, None] * W
-    Q = np.einsum("kvip,vij,lvjq->klpq", GWJ, weighted, GWJ, optimize=True)
-    GW = shapes @ weighted
-    PP = np.einsum("kpq,qr,lrs->klps", P, simple, P, optimize=True)
-    fisher = (
-        np.einsum("kvij,lvji->kl", GW, GW, optimize=True)
-        - 2 * np.einsum("klpq,qp->kl", Q, simple)
-        + np.einsum("klpq,qp->kl", PP, simple)
-    )
+    simple = np.linalg.pinv(np.tensordot(J, WJ, axes=([0, 1], [0, 1])), hermitian=True)
+    GWJ, GW = shapes @ WJ, shapes @ weighted
+    P = np.tensordot(WJ, GWJ, axes=([0, 1], [1, 2])).transpose(1, 0, 2)
+    Q = np.tensordot(GWJ, weighted @ GWJ, axes=([1, 2], [1, 2])).transpose(0, 2, 1, 3)
+    PP = P[:, None] @ simple @ P[None]
+    fisher = np.einsum("kvij,lvji->kl", GW, GW) - 2 * (Q * simple).sum(axis=(2, 3)) + (PP * simple).sum(axis=(2, 3))
     spread = 2 * np.linalg.pinv(fisher, hermitian=True)
-    extra = 2 * simple @ np.einsum("kl,klpq->pq", spread, Q - PP) @ simple
-    return simple + extra, np.asarray(extra)
+    extra = 2 * simple @ np.tensordot(spread, Q - PP, axes=2) @ simple
+    return np.asarray(simple + extra), np.asarray(extra)

@@ -27,24 +27,26 @@ _FITS = 4.0
 _FAR_M = 20.0
 
 
-def find_mistake(M: Array, C: Array, as_given: Consensus) -> Verdict | None:
+def find_mistake(M: Array, C: Array, on_the_arm: bool, as_given: Consensus) -> Verdict | None:
     """The reading of the views that makes much more sense than the one given.
 
     Args:
         M: T_parent_child (V, 4, 4).
         C: T_camera_board (V, 4, 4).
+        on_the_arm: the arm carries the board, not the camera.
         as_given: what the views agree on as they are, with the scale free.
     """
     if max(_size(M), _size(C)) > _FAR_M:
         return refuse(
             Reason.WRONG_UNITS, f"positions of {max(_size(M), _size(C)):.0f} m: they are in millimetres, not in metres"
         )
+    arm_transposed = _transposed(M) if on_the_arm else invert(_transposed(invert(M)))
     readings = (
         (Reason.WRONG_MOUNT, "they fit a camera at the other end: on the flange, or fixed instead", invert(M), C),
         (Reason.INVERTED_POSES, "they fit when the camera's poses are inverted", M, invert(C)),
         (Reason.INVERTED_POSES, "they fit when the camera's and the arm's poses are inverted", invert(M), invert(C)),
         (Reason.TRANSPOSED_POSES, "they fit when the camera's rotations are transposed", M, _transposed(C)),
-        (Reason.TRANSPOSED_POSES, "they fit when the arm's rotations are transposed", _transposed(M), C),
+        (Reason.TRANSPOSED_POSES, "they fit when the arm's rotations are transposed", arm_transposed, C),
         (Reason.SHIFTED_PAIRING, "each image fits the arm pose of the view before it", M[:-1], C[1:]),
         (Reason.SHIFTED_PAIRING, "each image fits the arm pose of the view after it", M[1:], C[:-1]),
     )

@@ -32,6 +32,7 @@ from calibration.verdict import (
     MIN_VIEWS,
     Reason,
     Verdict,
+    check_intrinsics,
     check_result,
     check_rotation,
     check_scale,
@@ -167,10 +168,12 @@ class _Candidate:
 def _solve_usable(views: Views, refine_intrinsics: bool) -> tuple[Verdict, Estimate | None, tuple[ViewErrors, ...]]:
     M, on_the_arm = views.T_parent_child, views.mount == "fixed"
     sight = _look(views)
-    mistake = find_mistake(M, sight.T_camera_board, find_consensus(M, sight.T_camera_board, free_scale=True))
+    as_given = find_consensus(M, sight.T_camera_board, free_scale=True)
+    mistake = find_mistake(M, sight.T_camera_board, on_the_arm, as_given)
     if mistake:
         return mistake, None, tuple(ViewErrors(name, used=True) for name in views.names)
-    best = _best(_candidates(views, M, sight, on_the_arm, refine_intrinsics))
+    candidates = _candidates(views, M, sight, on_the_arm)
+    best = _best(candidates if refine_intrinsics else [each for each in candidates if not each.refined])
     free = _free_scale(M, best.sight, best.fit, on_the_arm)
     scale_sigma = float(np.sqrt(free.covariance[12, 12]))
     C, lever = best.sight.T_camera_board, _lever(best.sight)
@@ -178,9 +181,10 @@ def _solve_usable(views: Views, refine_intrinsics: bool) -> tuple[Verdict, Estim
         find_partial_shift(M, C, best.X, best.Z, best.fit.used, views.names, lever)
         or (check_scale(free.scale, scale_sigma) if _turns_agree(free) else None)
         or _check_used(best, M, len(views))
+        or check_intrinsics(best.score, min(candidate.score for candidate in candidates))
         or _check_result(best)
     )
-    return verdict, _estimate(views, best, free.scale, scale_sigma), _view_errors(views, best)
+    return verdict, _estimate(views, best, float(free.scale), scale_sigma), _view_errors(views, best)
 
 
 def _look(views: Views) -> _Sight:
@@ -201,19 +205,20 @@ def _sight(stack: CornerStack, intrinsics: Array, poses: BoardPoses) -> _Sight:
     return _Sight(poses.T_camera_board, poses, stack, intrinsics)
 
 
-def _candidates(views: Views, M: Array, sight: _Sight, on_the_arm: bool, refine_intrinsics: bool) -> list[_Candidate]:
-    """Results to choose from, the one that is taken between equals first."""
+def _candidates(views: Views, M: Array, sight: _Sight, on_the_arm: bool) -> list[_Candidate]:
+    """Results to choose from, the one that is taken between equals first.
+
+    One with refined intrinsics is always among them: it tells whether those that were given can be true.
+    """
     from_poses = _from_poses(M, sight, on_the_arm)
     if views.camera is None or sight.stack is None:
         return [from_poses]
     candidates = [_bundle(M, from_poses, views.camera, on_the_arm), from_poses]
-    if refine_intrinsics:
-        for _ in range(_INTRINSICS_ROUNDS):
-            refined = _bundle(M, from_poses, views.camera, on_the_arm, refine_intrinsics=True)
-            # Noise and outliers look different through the right lens.
-            from_poses = _from_poses(M, refined.sight, on_the_arm)
-        candidates.append(refined)
-    return candidates
+    for _ in range(_INTRINSICS_ROUNDS):
+        refined = _bundle(M, from_poses, views.camera, on_the_arm, refine_intrinsics=True)
+        # Noise and outliers look different through the right lens.
+        from_poses = _from_poses(M, refined.sight, on_the_arm)
+    return [*candidates, refined]
 
 
 def _best(candidates: list[_Candidate]) -> _Candidate:

@@ -23,6 +23,8 @@ MAX_SCALE_ERROR = 0.01
 _SCALE_SIGMAS = 4.0
 # Beyond these factors nobody printed a wrong square: metres and millimetres were mixed up.
 _UNIT_FACTORS = (0.05, 20.0)
+# Where refining the intrinsics leaves less than this share of the held-out error, those that were given are wrong.
+MAX_INTRINSICS_GAIN = 0.7
 # Held-out errors of the median view with which nothing can be picked.
 MAX_HELD_OUT_MM, MAX_HELD_OUT_DEG = 15.0, 1.5
 # One standard deviation of the result, in its worst direction.
@@ -41,6 +43,7 @@ class Reason(str, enum.Enum):
     SHIFTED_PAIRING = "shifted_pairing"
     WRONG_UNITS = "wrong_units"
     WRONG_SQUARE_SIZE = "wrong_square_size"
+    WRONG_INTRINSICS = "wrong_intrinsics"
     INCONSISTENT = "inconsistent"
     UNCERTAIN = "uncertain"
     CLOCKS = "clocks"
@@ -59,6 +62,8 @@ _CURES = {
     Reason.WRONG_UNITS: "Give every position in metres.",
     Reason.WRONG_SQUARE_SIZE: "Measure the squares of the printed board and give that size; print at 100 %. If they "
     "are right, the intrinsics are not: try --refine-intrinsics.",
+    Reason.WRONG_INTRINSICS: "Give the intrinsics of this camera at this resolution, or let --refine-intrinsics find "
+    "them.",
     Reason.INCONSISTENT: "See that board and camera are bolted firmly, that the arm stands still at each shot, and "
     "that its poses are those of the flange; then take new views.",
     Reason.UNCERTAIN: "Take more views, spread over the workspace, with larger tilts and different distances.",
@@ -125,9 +130,23 @@ def check_scale(scale: float, sigma: float) -> Verdict | None:
     if abs(scale - 1) > max(MAX_SCALE_ERROR, _SCALE_SIGMAS * sigma):
         return refuse(
             Reason.WRONG_SQUARE_SIZE,
-            f"by the arm's motion, the board is {100 * scale:.1f} % of its stated size (+- {100 * sigma:.1f} %)",
+            f"by the arm's motion, the board is {100 * scale:.2f} % of its stated size (+- {100 * sigma:.2f} %)",
         )
     return None
+
+
+def check_intrinsics(score: float, free_score: float) -> Verdict | None:
+    """Refuse intrinsics that cannot be true.
+
+    Args:
+        score: held-out error with the intrinsics as they are used.
+        free_score: the least with others.
+    """
+    if free_score >= MAX_INTRINSICS_GAIN * score:
+        return None
+    return refuse(
+        Reason.WRONG_INTRINSICS, f"other intrinsics lower the held-out error from {score:.2f} to {free_score:.2f} px"
+    )
 
 
 def check_result(held_out_mm: float, held_out_deg: float, sigma_mm: float, sigma_deg: float) -> Verdict:
