@@ -52,6 +52,9 @@ _POLL_S = 0.01
 
 _NOT_CONNECTED = "not connected; connect it first"
 
+# Where nobody listens to its logger, the library would write every failed request to stderr.
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
+
 
 class RG2Options(BaseModel):
     """`gripper` of a hardware cell.
@@ -232,8 +235,6 @@ class RG2(Gripper):
             from pymodbus.client import ModbusTcpClient
         except ImportError as error:
             raise ConfigError(f"pymodbus cannot be imported ({error}): pip install 'robotcell[hardware]'") from error
-        # The library reports every failed request to stderr where nobody listens to its logger.
-        logging.getLogger("pymodbus").addHandler(logging.NullHandler())
         options = self._options
         # A motion that is sent twice is done twice.
         client = ModbusTcpClient(

@@ -83,7 +83,8 @@ class UR5e(Arm):
     def connect(self) -> None:
         """Check the controller, start our program on it and set the tool. Does nothing when connected.
 
-        An arm in a protective stop is connected as it stands, so that it can be recovered.
+        An arm in a protective stop, or with a program on it, is connected as it stands: its mode says so, nothing moves
+        it, and `recover` makes it ready.
 
         Raises:
             ConnectionLost: the controller cannot be reached, or does not answer.
@@ -96,10 +97,14 @@ class UR5e(Arm):
         self.close()
         _warn_unconfirmed()
         try:
-            controller = self._inspect_idle()
+            controller, held = self._inspect_idle()
             self._check(controller)
+            if controller.protective_stop:
+                held = "it is in a protective stop: look at the cell, clear the contact, then run robotcell recover"
+            if held:
+                _LOG.warning("the arm at %s is not ready: %s", self._options.host, held)
             self._dashboard.connect()
-            self._start_child(control=not controller.protective_stop)
+            self._start_child(control=not held)
         except BaseException:
             self.close()
             raise
@@ -208,7 +213,10 @@ class UR5e(Arm):
         self._need_child().close()
         self._child = None
         try:
-            self._check(self._inspect_idle())
+            controller, held = self._inspect_idle()
+            self._check(controller)
+            if held or controller.protective_stop:
+                raise DeviceFault(f"the arm at {self._options.host}: {held or 'the protective stop came back'}")
             self._start_child(control=True)
         except BaseException:
             self.close()
@@ -228,21 +236,15 @@ class UR5e(Arm):
                 )
             self._clock.sleep(_POLL_S)
 
-    def _inspect_idle(self) -> Controller:
-        """The controller, once no program runs on it.
-
-        Raises:
-            DeviceFault: one still does.
-        """
+    def _inspect_idle(self) -> tuple[Controller, str]:
+        """The controller, once no program runs on it; and the words for one that still does, "" for none."""
         deadline = time.monotonic() + _PROGRAM_ENDS_S
         while True:
             controller = inspect(self._options.host)
             held = program_held(controller.runtime_state)
             # In a protective stop a program stays paused, until the recovery ends it.
-            if not held or controller.protective_stop:
-                return controller
-            if time.monotonic() > deadline:
-                raise DeviceFault(f"the arm at {self._options.host} is not free: {held}")
+            if not held or controller.protective_stop or time.monotonic() > deadline:
+                return controller, held
             self._clock.sleep(_POLL_S)
 
     def _check(self, controller: Controller) -> None:

@@ -189,7 +189,7 @@ def why_not_ready(robot_mode: int, safety_mode: int) -> str:
         return f"the arm is {mode}: {_POWER_ON}; then recover"
     return (
         "the arm's program was stopped or paused (at the pendant, by the watchdog, or by a motion that the controller "
-        "cannot do): look at the cell, then recover"
+        "cannot do), or another program is on it: look at the cell, then recover"
     )
 
 
