@@ -234,7 +234,7 @@ async def _serve(rg2: Rg2, host: str, port: int, faults: Connection, ready: Conn
         server.silent = inbox.find("modbus", Kind.STUCK) is not None
         server.garbled = inbox.find("modbus", Kind.GARBAGE) is not None
         refusal, delay = inbox.find("modbus", Kind.WRONG, "exception"), inbox.find("modbus", Kind.DELAYED)
-        server.refuses = None if refusal is None else int(refusal.value or Refusal.FAILURE)
+        server.refuses = None if refusal is None else min(max(int(refusal.value or Refusal.FAILURE), 1), 255)
         server.delay_s = 0.0 if delay is None else delay.value or _USUAL_S
         changed.set()
 

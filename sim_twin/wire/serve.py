@@ -229,7 +229,10 @@ class ServedCell:
         context = multiprocessing.get_context("spawn")
         faults, faults_out = context.Pipe(duplex=False)
         ready_in, ready = context.Pipe(duplex=False)
-        process = context.Process(target=entry, args=(*arguments, faults, ready), name=f"robotcell twin {name}")
+        # A daemon: a supervisor that ends without closing the cell does not wait for it.
+        process = context.Process(
+            target=entry, args=(*arguments, faults, ready), name=f"robotcell twin {name}", daemon=True
+        )
         # An interrupt at the terminal reaches the whole group; it is for the supervisor alone, from the first moment.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

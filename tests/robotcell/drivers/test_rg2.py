@@ -1,10 +1,12 @@
 """The driver against a served Compute Box with an RG2; tests/contract holds what every gripper does."""
 
 import re
+import socket
 import threading
 import time
 from multiprocessing import resource_tracker
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 from pymodbus.client import ModbusTcpClient
@@ -15,6 +17,7 @@ from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
 from sim_twin.wire.faults import Fault, Kind
 from sim_twin.wire.serve import ServedCell
+from tests.sim_twin.cells import joints_at, tool_down
 
 HOST = "127.0.0.26"
 # Twice what a lost, silent or garbling device may hold the program for: computers that run tests are busy.
@@ -22,10 +25,22 @@ BOUND_S = 2.0
 LIMIT_S = 20.0
 
 
+SCENE = """
+name = "one cube"
+[[object]]
+name = "cube"
+shape = "cube"
+color = "red"
+position = [0.0, 0.0, 0.025]
+"""
+
+
 @pytest.fixture(scope="module")
-def served():
+def served(tmp_path_factory):
     resource_tracker.ensure_running()
-    config = load_config(None, {"backend.options.objects": 1})
+    scene = tmp_path_factory.mktemp("scenes") / "cube.toml"
+    scene.write_text(SCENE, encoding="utf-8")
+    config = load_config(None, {"backend.options.scene": str(scene)})
     with ServedCell(config, HOST, modbus_port=0, camera_port=0) as cell:
         yield cell
 
@@ -111,6 +126,32 @@ def test_the_world_sees_what_the_driver_does(served, gripper):
     assert state.width_m == pytest.approx(0.03, abs=5e-4)
     assert served.state()["width_m"] == pytest.approx(0.03, abs=5e-4)
     go(gripper, 0.08)
+
+
+def test_an_object_is_felt_and_one_without_the_bit_is_a_fault(served, gripper):
+    """The cube stands in the middle of the workspace; the arm gets there by a program of its own."""
+    above, around = (joints_at(tool_down(-0.5, 0.0, z)) for z in (0.15, 0.015))
+    move_arm(served, above, around)
+    state = go(gripper, 0.0)
+    assert state.grip_detected
+    assert 0.044 < state.width_m < 0.0505
+    move_arm(served, above)
+    inject(served, "state", Kind.WRONG, "no_grip")
+    fails_soon(gripper.state, DeviceFault, r"were sent to 0\.0 mm")
+    served.clear()
+    works_soon(gripper.state)
+    assert gripper.state().grip_detected
+    state = go(gripper, 0.08)
+    assert not state.grip_detected
+    assert state.width_m == pytest.approx(0.08, abs=5e-4)
+
+
+def move_arm(served, *targets):
+    host, _, port = served.endpoints["script"].rpartition(":")
+    moves = [f"  movej({target.tolist()}, a=1.4, v=1.0)" for target in targets]
+    with socket.create_connection((host, int(port)), timeout=5) as script:
+        script.sendall("\n".join(["def go():", *moves, "end", ""]).encode())
+        soon(lambda: np.abs(served.state()["q"] - targets[-1]).max() < 0.002)
 
 
 @pytest.mark.parametrize("offset", [0.005, -0.004])
