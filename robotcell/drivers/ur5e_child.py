@@ -321,7 +321,7 @@ def main() -> NoReturn:
     if sys.platform == "linux":
         # Ahead of everything else on the computer, where the system allows it: the watchdog does not wait.
         with suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(10))
     pipe, memory = Connection(int(sys.argv[1])), mmap(int(sys.argv[2]), 0)
     try:
         setup = pipe.recv()

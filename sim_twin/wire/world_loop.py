@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,7 @@ from sim_twin.arm import JOINT_GAINS
 from sim_twin.backend import TwinOptions
 from sim_twin.gripper import TwinGripper
 from sim_twin.wire.shared import ARM_COMMAND, CELL_STATE, GRIPPER_COMMAND, Record, poses_dtype
+from sim_twin.wire.ur_motion import PERIOD_S
 from sim_twin.world import STEP_S, World
 
 if TYPE_CHECKING:
@@ -25,6 +27,11 @@ if TYPE_CHECKING:
 
 # A controller whose tick stands still for this long is dead: the brakes fall in.
 _CONTROLLER_SILENCE_S = 0.05
+# The joints follow this far behind the newest target, so that a world that is late now and then finds targets to follow
+# and no jump: a jump would turn the joints faster than anybody told them to.
+_FOLLOW_BEHIND_S = 0.008
+# By how much faster the targets are passed through, per second that the world is behind.
+_CATCH_UP_PER_S = 10.0
 # Behind by less than this, the world catches up; by more, it leaves steps out.
 _MAX_LAG_S = 0.1
 # The poses of all visuals cost three steps of physics: at 60 Hz a frame of the camera is at most 17 ms behind.
@@ -78,6 +85,34 @@ def serve_world(
             record.close()
 
 
+class _Targets:
+    """The controller's targets at the pace of the world's steps."""
+
+    def __init__(self) -> None:
+        # (time of the controller [s], joint angles), oldest first, and the time that the joints have got to.
+        self._ahead: deque[tuple[float, Array]] = deque()
+        self._time = 0.0
+
+    def step(self, time_s: float, q: Array) -> Array:
+        """The target of the next step; `time_s` and `q` are the controller's newest."""
+        if not self._ahead:
+            self._time = time_s
+        if not self._ahead or time_s > self._ahead[-1][0]:
+            self._ahead.append((time_s, q))
+        newest = self._ahead[-1][0]
+        pace = 1 + _CATCH_UP_PER_S * (newest - _FOLLOW_BEHIND_S - self._time)
+        self._time = min(self._time + STEP_S * min(max(pace, 0.0), 2.0), newest)
+        while len(self._ahead) > 1 and self._ahead[1][0] <= self._time:
+            self._ahead.popleft()
+        (begin, q_begin), (end, q_end) = self._ahead[0], self._ahead[min(1, len(self._ahead) - 1)]
+        share = (self._time - begin) / (end - begin) if end > begin else 0.0
+        return q_begin + max(share, 0.0) * (q_end - q_begin)
+
+    def forget(self) -> None:
+        """Begin anew with the next target."""
+        self._ahead.clear()
+
+
 class _Joints:
     """Holds the joints at what the controller commands, or by their brakes."""
 
@@ -87,6 +122,7 @@ class _Joints:
         self.joints = world.joint_index(robot_model.ARM_JOINTS)
         self._tick = -1
         self._heard_at = -np.inf
+        self._targets = _Targets()
         # Where the brakes hold the arm, while they do.
         self._held: Array | None = None
 
@@ -97,10 +133,11 @@ class _Joints:
             self._tick, self._heard_at = int(command["tick"]), now
         if command["powered"] and now - self._heard_at < _CONTROLLER_SILENCE_S:
             self._held = None
-            target = command["q"]
+            target = self._targets.step(self._tick * PERIOD_S, command["q"])
         else:
             if self._held is None:
                 self._held, _ = self._world.joint_states(self.joints)
+                self._targets.forget()
             target = self._held
         self._world.drive_positions(self.joints, target.tolist(), robot_model.JOINT_TORQUE_NM, JOINT_GAINS)
 
