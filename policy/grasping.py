@@ -135,6 +135,34 @@ def find_grasps(table: Table, cells: npt.NDArray[np.bool_], jaw: Jaw) -> Grasps:
     return _join([found, *refined])
 
 
+def finger_reach(opening_m: float) -> float:
+    """Distance [m] from the centre of a grasp to the farthest corner that a finger needs room at."""
+    along = opening_m / 2 + linkage.FINGER_THICKNESS_M + _SIDE_MARGIN_M
+    return math.hypot(along, linkage.FINGER_BREADTH_M / 2 + _SIDE_MARGIN_M)
+
+
+def finger_room(
+    table: Table,
+    row: npt.NDArray[np.intp],
+    col: npt.NDArray[np.intp],
+    rotation: npt.NDArray[np.intp],
+    jaw: Jaw,
+) -> npt.NDArray[np.float32]:
+    """(N,) 0..1: whether the open fingers of grasps at (N,) cells and rotations come down without touching anything."""
+    room = np.zeros(len(row), np.float32)
+    center = (row + table.pad) * table.height_m.shape[1] + col + table.pad
+    tip = _tcp(table, center, jaw) + np.float32(linkage.tip_retraction(jaw.opening_m))
+    for k in np.unique(rotation):
+        at = np.flatnonzero(rotation == k)
+        room[at] = _finger_room(table, center[at], tip[at], int(k), jaw.opening_m)
+    return room
+
+
+def _tcp(table: Table, center: npt.NDArray[np.intp], jaw: Jaw) -> npt.NDArray[np.float32]:
+    """Height of the tcp above the table at a grasp."""
+    return np.asarray(np.maximum(table.top_m.ravel()[center] - GRASP_DEPTH_M, jaw.tip_clearance_m), np.float32)
+
+
 def _score(
     table: Table,
     rows: npt.NDArray[np.intp],
@@ -151,7 +179,7 @@ def _score(
     if not len(rows):
         return grasps
     k = int(rotation[0])
-    tcp = np.maximum(surface - GRASP_DEPTH_M, jaw.tip_clearance_m)
+    tcp = _tcp(table, center, jaw)
     tip = tcp + np.float32(linkage.tip_retraction(jaw.opening_m))
     room = _finger_room(table, center, tip, k, jaw.opening_m)
     fits = np.flatnonzero(room > 0)

@@ -48,7 +48,9 @@ def cell_centers(workspace: Workspace, rows: npt.NDArray[np.intp], cols: npt.NDA
     return np.asarray(x, np.float64), np.asarray(y, np.float64)
 
 
-def estimate_surface(heightmap: Heightmap, camera: Array, table_height_m: float) -> Surface:
+def estimate_surface(
+    heightmap: Heightmap, camera: Array, table_height_m: float, wanted: npt.NDArray[np.bool_] | None = None
+) -> Surface:
     """Complete a heightmap along the lines of sight.
 
     Going from an unknown cell towards the camera, each seen cell bounds what may be hidden: the line from the
@@ -59,11 +61,13 @@ def estimate_surface(heightmap: Heightmap, camera: Array, table_height_m: float)
         heightmap: with NaN where nothing was seen.
         camera: position (3,) in the base frame [m].
         table_height_m: z of the table in the base frame.
+        wanted: (H, W) where it is to be complete; elsewhere unknown cells are left NaN. None for everywhere.
     """
     workspace = heightmap.workspace
     known = close_gaps(heightmap.height_m)
     known = _without_spikes(known)
-    rows, cols = np.nonzero(np.isnan(known))
+    unknown = np.isnan(known)
+    rows, cols = np.nonzero(unknown if wanted is None else unknown & wanted)
     height, ceiling = known.copy(), known
     eye_row = (camera[1] - workspace.y[0]) / workspace.resolution_m - 0.5
     eye_col = (camera[0] - workspace.x[0]) / workspace.resolution_m - 0.5
