@@ -7,7 +7,6 @@ could not be made in time leaves a gap, as one that a device dropped does. Nothi
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import socket
 import sys
@@ -51,8 +50,6 @@ _PERIOD_S = 1 / FRAMES_PER_S
 _IDLE_S = 0.1
 _LONGEST_DELAY_S = 5.0
 _MOST_CLIENTS = 8
-# The camera gives way to the controller, whose period is shorter.
-_NICENESS = 5
 
 
 def serve_camera(
@@ -77,7 +74,6 @@ def serve_camera(
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    os.nice(_NICENESS)
     server = CameraServer(host, port, config, visuals, poses, faults)
     try:
         try:
