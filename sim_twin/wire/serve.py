@@ -38,8 +38,6 @@ _START_S = 90.0
 _END_S = 5.0
 # The controller keeps a period of 2 ms: it goes ahead of everything else on the computer, where the system allows it.
 _REALTIME = ("ur",)
-# World and box keep up with the clock as well; that they are a millisecond late matters less.
-_NICENESS = {"world": -10, "box": -10}
 FAULTS: dict[Device, frozenset[tuple[str, Kind, str]]] = {
     "arm": ur.FAULTS,
     "gripper": box.FAULTS,
@@ -244,9 +242,6 @@ class ServedCell:
         if name in _REALTIME and process.pid is not None and sys.platform == "linux":
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(process.pid, os.SCHED_RR, os.sched_param(10))
-        if name in _NICENESS and process.pid is not None:
-            with contextlib.suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS[name])
         # The child's ends are the child's alone, so that each side sees when the other is gone.
         faults.close()
         ready.close()
