@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from ur_analytic_ik import ur5e
 
-from robotcell.geometry import cross
+from robotcell.geometry import cross, rotation_z
 
 if TYPE_CHECKING:
     from robotcell.geometry import Array
@@ -87,17 +87,18 @@ def inverse(T_base_flange: Array, q_near: npt.ArrayLike) -> Array | None:
     out of reach.
     """
     near = np.asarray(q_near, dtype=np.float64)
-    solutions = ur5e.inverse_kinematics(np.ascontiguousarray(T_base_flange, dtype=np.float64))
-    if not solutions:
-        return None
-    q = np.asarray(solutions)
-    q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi))
-    q = np.where(q > JOINT_LIMIT, q - 2 * np.pi, q)
-    q = np.where(q < -JOINT_LIMIT, q + 2 * np.pi, q)
-    q = q[(np.abs(q) <= JOINT_LIMIT).all(axis=1)]
-    if not len(q):
-        return None
-    return np.asarray(q[np.argmin(np.abs(q - near).max(axis=1))])
+    q = _nearest(T_base_flange, near)
+    if q is not None and np.abs(q - near).max() < _NEAR:
+        return q
+    # The solver loses a solution whose last joint stands within 1e-12 of zero: look once more with that joint turned.
+    T = np.asarray(T_base_flange, dtype=np.float64).copy()
+    T[:3, :3] = T[:3, :3] @ rotation_z(_TURN)
+    turn = np.array([0.0, 0.0, 0.0, 0.0, 0.0, _TURN])
+    turned = _nearest(T, near + turn)
+    if turned is None:
+        return q
+    turned = turned - turn
+    return turned if q is None or np.abs(turned - near).max() < np.abs(q - near).max() else q
 
 
 def inverse_along(T_base_flange: Array, q_start: npt.ArrayLike, max_step: float) -> Array:
@@ -126,3 +127,23 @@ def inverse_along(T_base_flange: Array, q_start: npt.ArrayLike, max_step: float)
             raise ValueError(f"the path passes a singularity at flange {where}: a joint would jump by {step:.2f} rad")
         path[i] = q = solution
     return path
+
+
+# A solution this near [rad] to where the arm is need not be looked for twice.
+_NEAR = 0.3
+_TURN = 1e-3
+
+
+def _nearest(T_base_flange: Array, near: Array) -> Array | None:
+    """The solver's solution within the joint limits that is nearest to `near` (6,), None if there is none."""
+    solutions = ur5e.inverse_kinematics(np.ascontiguousarray(T_base_flange, dtype=np.float64))
+    if not solutions:
+        return None
+    q = np.asarray(solutions)
+    q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi))
+    q = np.where(q > JOINT_LIMIT, q - 2 * np.pi, q)
+    q = np.where(q < -JOINT_LIMIT, q + 2 * np.pi, q)
+    q = q[(np.abs(q) <= JOINT_LIMIT).all(axis=1)]
+    if not len(q):
+        return None
+    return np.asarray(q[np.argmin(np.abs(q - near).max(axis=1))])
