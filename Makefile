@@ -5,13 +5,17 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' 2>/dev/null && echo $$p && break; done)
 
-.PHONY: demo test check bench setup clean
+.PHONY: demo test test-wire check bench setup clean
 
 demo: setup
 	$(BIN)/robotcell pick --goal red
 
 test: setup
 	$(BIN)/python -m pytest
+
+# Every fault of a served arm, in real time: about a minute.
+test-wire: setup
+	$(BIN)/python -m pytest tests/robotcell/drivers -m wire
 
 check: setup
 	$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import time
 from typing import TYPE_CHECKING
 
@@ -111,7 +112,9 @@ def arm(closed_arm: UR5e) -> UR5e:
 
 
 def name(value: object) -> str | None:
-    return value.value if isinstance(value, Kind) else None
+    if isinstance(value, type):
+        return value.__name__
+    return str(value.value) if isinstance(value, enum.Enum) else None
 
 
 @pytest.mark.parametrize(("channel", "kind", "what", "value"), LOST, ids=name)
@@ -142,7 +145,8 @@ def test_a_link_that_fails_in_a_motion_is_lost_and_the_arm_stands(
     works(arm)
 
 
-@pytest.mark.parametrize(("channel", "kind", "what", "value", "error", "words"), REFUSED)
+@pytest.mark.wire
+@pytest.mark.parametrize(("channel", "kind", "what", "value", "error", "words"), REFUSED, ids=name)
 def test_connecting_says_what_is_wrong(
     served: ServedCell,
     closed_arm: UR5e,
@@ -167,7 +171,8 @@ def test_connecting_says_what_is_wrong(
     works(closed_arm)
 
 
-@pytest.mark.parametrize(("what", "mode"), STOPPED)
+@pytest.mark.wire
+@pytest.mark.parametrize(("what", "mode"), STOPPED, ids=name)
 def test_a_stop_in_a_motion_is_seen_at_once_and_nothing_moves_until_recovered(
     served: ServedCell, arm: UR5e, what: str, mode: ArmMode
 ) -> None:
