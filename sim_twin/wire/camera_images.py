@@ -32,8 +32,8 @@ IMAGE_FAULTS: frozenset[tuple[str, Kind, str]] = frozenset(
     }
 )
 
-# Nothing has moved that has not moved by this much [m, rad]: a tenth of the depth noise, and of a pixel. Objects at rest
-# tremble by a third of it.
+# Nothing has moved that has not moved by this much [m, rad]: a tenth of the depth noise, and of a pixel. Objects at
+# rest tremble by a third of it.
 _SAME_POSE = 1e-4
 _HOLE_PX = 16
 _LONGEST_DELAY_S = 5.0
