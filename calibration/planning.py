@@ -20,7 +20,7 @@ from calibration.target import plate_corners, size_m
 from robotcell import collision, kinematics
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import Array, invert_transform, make_transform, transform_points
-from robotcell.primitives import JointMove, MotionPlan
+from robotcell.primitives import TALLEST_OBJECT_M, JointMove, MotionPlan
 from robotcell.safety import check_plan
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ _MIN_SQUARE_PX = 20
 _MARGIN = 0.06
 # Room around the plate for how differently it may be held.
 _CLEARANCE_M = 0.015
+# Whatever stands on the table stays there; board, gripper and wrists pass over it.
+_ABOVE_TABLE_M = TALLEST_OBJECT_M + _CLEARANCE_M
 _POINT_SPACING_M = 0.02
 # A plate that sways: slower than a job.
 _JOINT_SPEED_RAD_S = 0.6
@@ -199,6 +201,9 @@ def _find_hub(
         if q is None:
             refused["out of reach"] += 1
             continue
+        if _hidden(q, held, T_base_camera[:3, 3]):
+            refused["the arm hides the board"] += 1
+            continue
         try:
             plan_way("first view", q_start, q, held, config)
         except UnsafeMotion as error:
@@ -230,7 +235,7 @@ def _candidates(
         if not visible(T_camera_board, held, intrinsics):
             continue
         q = kinematics.inverse(T_base_camera @ T_camera_board @ T_board_flange, hub)
-        if q is None:
+        if q is None or _hidden(q, held, T_base_camera[:3, 3]):
             continue
         try:
             # Where the arm cannot stand it cannot go either, and that is sooner found out.
@@ -294,17 +299,33 @@ def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str) -
     """Keep the plate clear of table, obstacles and arm along joint angles (N, 6)."""
     T_base_flange = kinematics.forward(path)
     points = np.einsum("nij,kj->nki", T_base_flange[:, :3, :3], held.points) + T_base_flange[:, None, :3, 3]
-    if points[..., 2].min() < config.table.height_m + _CLEARANCE_M:
-        raise UnsafeMotion(f"{label}: the board would touch the table")
+    centers = collision.sphere_centers(path)
+    wrists = collision.SPHERES.link >= _WRISTS
+    lowest = min(points[..., 2].min(), (centers[:, wrists, 2] - collision.SPHERES.radius[wrists]).min())
+    if lowest < config.table.height_m + _ABOVE_TABLE_M:
+        raise UnsafeMotion(f"{label}: the board or the wrist would touch what may stand on the table")
     for box in collision.obstacles(config):
         if collision.box_distance(box, points).min() < _CLEARANCE_M:
             raise UnsafeMotion(f"{label}: the board would enter the keep-out {box.name!r}")
     moves_apart = collision.SPHERES.link < _FLANGE
-    centers = collision.sphere_centers(path)[:, moves_apart]
-    gaps = np.linalg.norm(points[:, :, None] - centers[:, None], axis=-1) - collision.SPHERES.radius[moves_apart]
+    gaps = (
+        np.linalg.norm(points[:, :, None] - centers[:, None, moves_apart], axis=-1)
+        - collision.SPHERES.radius[moves_apart]
+    )
     if gaps.min() < _CLEARANCE_M:
         raise UnsafeMotion(f"{label}: the board would touch the arm")
 
 
-# Index of the flange among the frames of `collision.Spheres`.
-_FLANGE = 6
+def _hidden(q: Array, held: HeldBoard, eye: Array) -> bool:
+    """Whether the arm stands between the camera at `eye` (3,) and the board."""
+    points = transform_points(kinematics.forward(q), held.points)
+    moves_apart = collision.SPHERES.link < _FLANGE
+    to_center = collision.sphere_centers(q)[moves_apart] - eye
+    sight = points - eye
+    along = np.clip((to_center @ sight.T) / (sight**2).sum(axis=1), 0.0, 1.0)
+    gaps = np.linalg.norm(to_center[:, None] - along[..., None] * sight, axis=-1)
+    return bool((gaps < collision.SPHERES.radius[moves_apart, None]).any())
+
+
+# Indices of the first wrist and of the flange among the frames of `collision.Spheres`.
+_WRISTS, _FLANGE = 4, 6

@@ -161,7 +161,7 @@ def go_above(cell: Cell, spot: Array, height_m: float) -> None:
     Executor(cell).run(check_plan(MotionPlan("hover", q, tuple(steps)), config))
 
 
-def touch(cell: Cell, spot: Array) -> Touch:
+def touch_table(cell: Cell, spot: Array) -> Touch:
     """Feel for the table at a spot with the closed fingers: slowly, guarded, and never far below it.
 
     Raises:

@@ -7,18 +7,16 @@ from typing import Annotated
 
 import typer
 
+from cli.calibrate_cell import register
+
 # Everything heavy is imported inside the commands, so that --help answers at once.
 
-app = typer.Typer(help="Find where the camera stands.", no_args_is_help=True, pretty_exceptions_enable=False)
+app = typer.Typer(help="Find where the camera stands.", pretty_exceptions_enable=False)
+register(app)
 
 Source = Annotated[
     Path | None, typer.Argument(help="pairs.json, corners.json, or the folder of a session.", show_default=False)
 ]
-
-
-@app.callback()
-def calibrate() -> None:
-    """Find where the camera stands."""
 
 
 @app.command()

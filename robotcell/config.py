@@ -283,6 +283,8 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
         ConfigError: naming every bad key at once, each with its value and what is allowed.
     """
     values = read_toml(path, "examples/cell.toml") if path else {}
+    if path:
+        _beside(values, path)
     for key, value in (overrides or {}).items():
         _set(values, key, value)
     problems: list[str] = []
@@ -325,6 +327,13 @@ def read_toml(path: Path, example: str) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
+
+
+def _beside(values: dict[str, Any], path: Path) -> None:
+    """A relative path of the calibration file starts at the folder of the cell's file."""
+    camera = values.get("camera")
+    if isinstance(camera, dict) and isinstance(camera.get("calibration"), str):
+        camera["calibration"] = str(path.parent / camera["calibration"])
 
 
 def _set(values: dict[str, Any], dotted_key: str, value: object) -> None:

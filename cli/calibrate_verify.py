@@ -1,0 +1,114 @@
+"""`robotcell calibrate verify`: whether the calibration is good enough to pick with."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from calibration.verification import Touch, Verification, choose_spots, go_above, go_home, touch_table
+from cli.console import progress, report_error, results
+from robotcell.cell import Cell, open_cell
+from robotcell.config import CellConfig, load_config
+from robotcell.errors import CellError, ConfigError
+from robotcell.safety import check_config
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_NOT_GOOD = 1
+_TWIN = "twin"
+_HOVER_M = 0.010
+
+
+def run_verify(cell_file: Path | None, points: int, *, touch: bool, yes: bool, as_json: bool) -> int:
+    """Run the command; returns the exit code."""
+    try:
+        config = load_config(cell_file)
+        check_config(config)
+        alone = yes or config.backend.name == _TWIN
+        with open_cell(config) as cell:
+            verification = _verify(cell, points, touch=touch, alone=alone)
+    except CellError as error:
+        return report_error(error)
+    problems = verification.problems(config)
+    if as_json:
+        sys.stdout.write(json.dumps(_plain(verification, problems)) + "\n")
+    else:
+        _print(verification, problems, config)
+    return _NOT_GOOD if problems else 0
+
+
+def _verify(cell: Cell, points: int, *, touch: bool, alone: bool) -> Verification:
+    """Look, and go to each spot."""
+    if not alone:
+        deed = "feel for the table" if touch else "hover over the table"
+        if not typer.confirm(
+            f"The arm will {deed} at {points} bare spots. Is the cell clear, the gripper empty?", err=True
+        ):
+            raise ConfigError("nothing was moved")
+    go_home(cell)
+    table, spots = choose_spots(cell, points)
+    touches = []
+    for number, spot in enumerate(spots, 1):
+        if touch:
+            touches.append(touch_table(cell, spot))
+            continue
+        go_above(cell, spot, _HOVER_M)
+        touches.append(Touch(spot))
+        where = f"spot {number} of {len(spots)}, x {spot[0]:.3f}, y {spot[1]:.3f} m"
+        progress().print(Text(f"{where}: the tips stand {1000 * _HOVER_M:.0f} mm over the table"), soft_wrap=True)
+        if not alone:
+            typer.prompt("Measure the gap, then press Enter", default="", show_default=False, err=True)
+    go_home(cell)
+    return Verification(table, tuple(touches))
+
+
+def _plain(verification: Verification, problems: list[str]) -> dict[str, Any]:
+    table = verification.table
+    return {
+        "ok": not problems,
+        "problems": problems,
+        "table": {
+            "tilt_deg": float(np.degrees(table.tilt_rad)),
+            "offset_mm": 1000 * table.offset_m,
+            "rms_mm": 1000 * table.rms_m,
+        },
+        "spots": [
+            {
+                "place_m": touch.place.tolist(),
+                "touched_m": touch.touched_m,
+                "difference_mm": None if touch.difference_m is None else 1000 * touch.difference_m,
+            }
+            for touch in verification.touches
+        ],
+    }
+
+
+def _print(verification: Verification, problems: list[str], config: CellConfig) -> None:
+    out, plane = results(), verification.table
+    out.print(
+        Text(
+            f"table: tilted by {np.degrees(plane.tilt_rad):.2f} degrees "
+            f"(limit {np.degrees(config.limits.max_tilt_rad):.2f}), {1000 * plane.offset_m:+.1f} mm off "
+            f"(limit {1000 * config.limits.max_table_offset_m:.1f}), noise {1000 * plane.rms_m:.1f} mm"
+        ),
+        soft_wrap=True,
+    )
+    table = Table(box=None, pad_edge=False)
+    for heading in ("x m", "y m", "camera mm", "arm mm", "camera - arm mm"):
+        table.add_column(heading, justify="right")
+    for touch in verification.touches:
+        arm = "hovered" if touch.touched_m is None else f"{1000 * touch.touched_m:.2f}"
+        off = "" if touch.difference_m is None else f"{1000 * touch.difference_m:+.2f}"
+        table.add_row(f"{touch.place[0]:.3f}", f"{touch.place[1]:.3f}", f"{1000 * touch.place[2]:.2f}", arm, off)
+    out.print(table)
+    for problem in problems:
+        out.print(Text(problem, style="bold red"), soft_wrap=True)
+    if not problems:
+        out.print(Text("good enough to pick with", style="bold green"))
