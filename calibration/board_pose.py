@@ -25,6 +25,9 @@ _CONVERGED = 1e-10
 # The two poses under which a flat board looks alike differ in their residuals by little when it is far away.
 _AMBIGUOUS = 1.5
 _FLAT_M = 1e-6
+# A corner so many standard deviations off was taken for another one.
+_FALSE = 6.0
+_LEAST_PX = 0.05
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,15 @@ def settle_ambiguity(stack: CornerStack, intrinsics: Array, poses: BoardPoses, T
     return refine_poses(stack, intrinsics, np.where(better[:, None, None], other.T_camera_board, poses.T_camera_board))
 
 
+def without_false_corners(stack: CornerStack, intrinsics: Array, poses: BoardPoses) -> CornerStack:
+    """Leave out corners that are elsewhere than their view's others say; views that would keep too few stay whole."""
+    residual, _ = _linearise(stack, intrinsics, poses.T_camera_board)
+    true = np.linalg.norm(residual, axis=-1) < _FALSE * max(poses.sigma_px, _LEAST_PX)
+    seen = stack.seen * true
+    too_few = seen.sum(axis=1) < MIN_CORNERS
+    return CornerStack(stack.points, stack.px, np.where(too_few[:, None], stack.seen, seen), stack.center)
+
+
 def _linearise(stack: CornerStack, intrinsics: Array, T: Array) -> tuple[Array, Array]:
     """Residuals (V, K, 2), and the derivatives (V, K, 2, 6) of the prediction by the small change of the pose."""
     turned = stack.points @ np.swapaxes(T[:, :3, :3], 1, 2)
@@ -126,6 +138,7 @@ def _sigma(residual: Array, stack: CornerStack, before: float) -> float:
         size = np.linalg.norm(residual, axis=-1)[stack.seen > 0]
         sigma = float(np.median(size) / np.sqrt(2 * np.log(2)))
     else:
+        # Huber's proposal 2: a residual counts up to the size from which on its weight falls.
         weight = corner_weights(residual, stack.seen, before)
-        sigma = float(np.sqrt((weight[..., None] * residual**2).sum() / freedom))
+        sigma = float(np.sqrt(((weight[..., None] * residual) ** 2).sum() / freedom))
     return max(sigma, 1e-6)

@@ -52,13 +52,13 @@ class CornerStack:
 
 def stack_corners(corners: Sequence[Corners], board: dict[int, Point]) -> CornerStack:
     """Bring the corners of all views into one stack; every id must be on the board."""
-    most = max(len(view.ids) for view in corners)
+    most = max((len(view.ids) for view in corners), default=0)
     center = np.mean(list(board.values()), axis=0)
     points, px = np.zeros((len(corners), most, 3)), np.zeros((len(corners), most, 2))
     seen = np.zeros((len(corners), most))
     for i, view in enumerate(corners):
         count = len(view.ids)
-        points[i, :count] = np.array([board[int(corner)] for corner in view.ids]) - center
+        points[i, :count] = np.array([board[int(corner)] for corner in view.ids]).reshape(-1, 3) - center
         px[i, :count] = view.px
         seen[i, :count] = 1.0
     return CornerStack(points, px, seen, center)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -60,11 +61,15 @@ class Series:
     t: Array
     T: Array
 
+    @cached_property
+    def _turning(self) -> Slerp:
+        return Slerp(self.t, Rotation.from_matrix(self.T[:, :3, :3]))
+
     def at(self, t: Array) -> Array:
         """(M, 4, 4) poses at times within the series: position along the chord, rotation by slerp."""
         inside = np.clip(t, self.t[0], self.t[-1])
         T = np.tile(np.eye(4), (len(inside), 1, 1))
-        T[:, :3, :3] = Slerp(self.t, Rotation.from_matrix(self.T[:, :3, :3]))(inside).as_matrix()
+        T[:, :3, :3] = self._turning(inside).as_matrix()
         for axis in range(3):
             T[:, axis, 3] = np.interp(inside, self.t, self.T[:, axis, 3])
         return T
@@ -231,10 +236,11 @@ def _distinct(board: Series, flange: Series, offset: float) -> Series:
     if not len(board.t):
         raise CalibrationError("the two series do not overlap at any instant")
     T = flange.at(board.t - offset)
+    position, q = T[:, :3, 3], _quaternions(T)
     chosen = [0]
     for i in range(1, len(T)):
-        moved = difference(T[i], T[chosen[-1]])
-        if np.linalg.norm(moved[:3]) > _SAME_M or np.linalg.norm(moved[3:]) > _SAME_RAD:
+        last = chosen[-1]
+        if np.linalg.norm(position[i] - position[last]) > _SAME_M or _angles(q[i], q[last]) > _SAME_RAD:
             chosen.append(i)
     thinned = np.array(chosen)[np.unique(np.linspace(0, len(chosen) - 1, _MAX_VIEWS).astype(int))]
     return Series(board.t[thinned], board.T[thinned])

@@ -15,6 +15,7 @@ from calibration.board_pose import (
     settle_ambiguity,
     start_poses,
     usable_corners,
+    without_false_corners,
 )
 from calibration.bundle import BundleNoise, solve_bundle
 from calibration.closed_form import CLOSED_FORMS
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
 
 # Outliers are found again with the noise's shapes at the first result.
 _PASSES = 2
-_INTRINSICS_ROUNDS = 2
 # Held-out errors that differ by less are equal.
 _CLEARLY = 0.01
 # A turn counts as the distance that it moves a point this share of the way between camera and board.
@@ -172,7 +172,7 @@ def _solve_usable(views: Views, refine_intrinsics: bool) -> tuple[Verdict, Estim
     mistake = find_mistake(M, sight.T_camera_board, on_the_arm, as_given)
     if mistake:
         return mistake, None, tuple(ViewErrors(name, used=True) for name in views.names)
-    candidates = _candidates(views, M, sight, on_the_arm)
+    candidates = _candidates(views, M, sight, on_the_arm, refine_intrinsics)
     best = _best(candidates if refine_intrinsics else [each for each in candidates if not each.refined])
     free = _free_scale(M, best.sight, best.fit, on_the_arm)
     scale_sigma = float(np.sqrt(free.covariance[12, 12]))
@@ -198,14 +198,16 @@ def _look(views: Views) -> _Sight:
     expected = find_consensus(views.T_parent_child, poses.T_camera_board, free_scale=True)
     T_expected = predict(expected.X, expected.Z, views.T_parent_child)
     T_expected[:, :3, 3] /= expected.scale
-    return _sight(stack, intrinsics, settle_ambiguity(stack, intrinsics, poses, T_expected))
+    poses = settle_ambiguity(stack, intrinsics, poses, T_expected)
+    stack = without_false_corners(stack, intrinsics, poses)
+    return _sight(stack, intrinsics, refine_poses(stack, intrinsics, poses.T_camera_board))
 
 
 def _sight(stack: CornerStack, intrinsics: Array, poses: BoardPoses) -> _Sight:
     return _Sight(poses.T_camera_board, poses, stack, intrinsics)
 
 
-def _candidates(views: Views, M: Array, sight: _Sight, on_the_arm: bool) -> list[_Candidate]:
+def _candidates(views: Views, M: Array, sight: _Sight, on_the_arm: bool, refine_intrinsics: bool) -> list[_Candidate]:
     """Results to choose from, the one that is taken between equals first.
 
     One with refined intrinsics is always among them: it tells whether those that were given can be true.
@@ -214,10 +216,12 @@ def _candidates(views: Views, M: Array, sight: _Sight, on_the_arm: bool) -> list
     if views.camera is None or sight.stack is None:
         return [from_poses]
     candidates = [_bundle(M, from_poses, views.camera, on_the_arm), from_poses]
-    for _ in range(_INTRINSICS_ROUNDS):
-        refined = _bundle(M, from_poses, views.camera, on_the_arm, refine_intrinsics=True)
+    refined = _bundle(M, from_poses, views.camera, on_the_arm, refine_intrinsics=True)
+    if refine_intrinsics:
         # Noise and outliers look different through the right lens.
-        from_poses = _from_poses(M, refined.sight, on_the_arm)
+        refined = _bundle(
+            M, _from_poses(M, refined.sight, on_the_arm), views.camera, on_the_arm, refine_intrinsics=True
+        )
     return [*candidates, refined]
 
 
