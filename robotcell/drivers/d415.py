@@ -12,7 +12,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from robotcell.drivers.d415_images import D415Images
-from robotcell.drivers.realsense import USB_ADVICE, check_usb, find_device, load_pyrealsense2, sdk_errors, serial_number
+from robotcell.drivers.realsense import (
+    USB_ADVICE,
+    check_usb,
+    describe_device,
+    find_device,
+    load_pyrealsense2,
+    sdk_errors,
+    serial_number,
+)
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Camera, RgbdFrame
 
@@ -98,6 +106,8 @@ class D415(Camera):
         self._pipeline: Any = None
         self._images: D415Images | None = None
         self._serial: str | None = None
+        # What is connected, in words; empty before.
+        self.description = ""
         self._last_number = -1
         # Frames of earlier rounds of a recorded file.
         self._earlier_numbers = 0
@@ -177,6 +187,7 @@ class D415(Camera):
             context = rs.context()
             device = self._open_recording(rs, context, config)
         self._serial = serial_number(device)
+        self.description = describe_device(device)
         if self._mount.measured is not None:
             self._mount.measured.check(serial=self._serial, resolution=(width, height))
         self._start(rs, context, config, device)

@@ -108,6 +108,23 @@ def serial_number(device: Any) -> str:
         return str(device.get_info(load_pyrealsense2().camera_info.serial_number))
 
 
+def describe_device(device: Any) -> str:
+    """Name, serial number, firmware and USB link of a device, as far as it tells them.
+
+    Raises:
+        ConnectionLost: it does not answer.
+    """
+    info = load_pyrealsense2().camera_info
+    parts = (
+        ("", info.name),
+        ("serial ", info.serial_number),
+        ("firmware ", info.firmware_version),
+        ("USB ", info.usb_type_descriptor),
+    )
+    with sdk_errors("asking the camera what it is"):
+        return ", ".join(word + device.get_info(key) for word, key in parts if device.supports(key))
+
+
 def check_usb(device: Any) -> None:
     """Refuse a camera on a USB 2 link, which cannot carry both streams.
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from robotcell.interfaces import Clock
 
-_COMMAND, _CONTROL, _SET_OFFSET, _PRODUCT = 0, 2, 1031, 1536
+_COMMAND, _CONTROL, _SET_OFFSET, _PRODUCT, _FIRMWARE = 0, 2, 1031, 1536, 1540
 # From the fingertip offset to the width with offset, in one read: all of one moment.
 _STATE = range(258, 276)
 _OFFSET, _BARE_WIDTH, _STATUS, _TIP_WIDTH = 258, 267, 268, 275
@@ -203,6 +203,15 @@ class RG2(Gripper):
         """
         self._write(_CONTROL, [_STOP], "to stop")
         self._command = None
+
+    def firmware(self) -> str:
+        """Version of the gripper's firmware: major.minor, build.
+
+        Raises:
+            ConnectionLost: the box does not answer.
+        """
+        version, build = self._read(_FIRMWARE, 2, "its firmware")
+        return f"{version >> 8}.{version & 0xFF}, build {build}"
 
     def recover(self) -> None:
         """Power-cycle the gripper, which resets a safety switch that tripped. Only because an operator asked for it.
