@@ -13,9 +13,9 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest
 
-# Every fault of a served arm, in real time: about a minute.
+# Every fault of a served arm, and a job over the wire, in real time: about two minutes.
 test-wire: setup
-	$(BIN)/python -m pytest tests/robotcell/drivers -m wire
+	$(BIN)/python -m pytest -m wire
 
 check: setup
 	$(BIN)/ruff check .
