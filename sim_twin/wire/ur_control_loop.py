@@ -13,7 +13,7 @@ import numpy as np
 from robotcell import kinematics
 from sim_twin.wire import ur_motion
 from sim_twin.wire.ur_controller import Payload, Watchdog
-from sim_twin.wire.ur_motion import PERIOD_S, ForceMode, Motion, Move, ScriptError
+from sim_twin.wire.ur_motion import PERIOD_S, ForceMode, Motion, Move, ScriptError, checked
 from sim_twin.wire.ur_pose import ZERO_POSE, Pose, matrix_to_pose, pose_to_matrix
 from sim_twin.wire.ur_program import Program, Thread
 
@@ -88,7 +88,7 @@ class ControlLoop:
             25: lambda: self._answer(self._controller.contact_steps(self._floats(0, 3))),
             26: lambda: self._answer_floats((PERIOD_S,)),
             27: lambda: self._answer_floats(self._controller.joints_before(self._int(1)).tolist()),
-            28: lambda: self._answer_floats(ur_motion.tcp_pose(self._arm, self._arm.q)),
+            28: lambda: self._answer_floats(ur_motion.tcp_pose(self._arm, self._arm.waypoint)),
             29: lambda: self._controller.set_tcp(self._floats(0, 6)),
             30: lambda: self._inverse(self._six(6)),
             31: lambda: self._controller.protective_stop("the program asked for it"),
@@ -164,10 +164,11 @@ class ControlLoop:
         return self._registers.input_int[self._offset + index]
 
     def _floats(self, index: int, count: int) -> list[float]:
-        return self._registers.input_double[self._offset + index : self._offset + index + count]
+        values = self._registers.input_double[self._offset + index : self._offset + index + count]
+        return [checked(value) for value in values]
 
     def _float(self, index: int) -> float:
-        return self._registers.input_double[self._offset + index]
+        return checked(self._registers.input_double[self._offset + index])
 
     def _six(self, index: int) -> Array:
         return np.array(self._floats(index, 6))

@@ -28,6 +28,8 @@ _ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
 # Two targets of neighbouring periods may differ by this much: half more than at the fastest joint speed.
 _MAX_STEP_RAD = 1.5 * kinematics.MAX_JOINT_SPEED * PERIOD_S
 _ARRIVED_RAD = 1e-9
+_LARGEST = 1e6
+_SLOWEST = 1e-5
 # Inverse kinematics is exact to this many digits; an arm that follows them stands still.
 _STEADY_RAD_S = 1e-5
 
@@ -36,6 +38,17 @@ Motion: TypeAlias = Generator[None, None, None]
 
 class ScriptError(Exception):
     """A script does what the controller refuses; it dies with this message."""
+
+
+def checked(number: float) -> float:
+    """A number that a script may use.
+
+    Raises:
+        ScriptError: it is none, or so large that no robot has a use for it.
+    """
+    if not abs(number) <= _LARGEST:
+        raise ScriptError(f"{number} is no number that the controller can use")
+    return number
 
 
 class Arm:
@@ -57,6 +70,7 @@ class Arm:
         force_mode: what the tool gives way to, None when it is stiff.
         reachable: whether inverse kinematics finds anything; a fault can take it away.
         arrives: whether a move ever ends; a fault can take it away.
+        waypoint: (6,) where the move under way, or the last one, leads.
     """
 
     def __init__(self, q: Array) -> None:
@@ -72,6 +86,7 @@ class Arm:
         self.force_mode: ForceMode | None = None
         self.reachable = True
         self.arrives = True
+        self.waypoint = self.q
         self.tcp: Pose = ZERO_POSE
         self.set_tcp(ZERO_POSE)
         self._zero_wrench = np.zeros(6)
@@ -143,7 +158,8 @@ class Arm:
         if self._commanded:
             raise ScriptError("another thread is already controlling the robot")
         step = np.abs(q - self.q)
-        if step.max() > _MAX_STEP_RAD:
+        # A step that is no number is refused too.
+        if not step.max() <= _MAX_STEP_RAD:
             joint = int(step.argmax())
             raise ScriptError(
                 f"joint {joint + 1} would have to turn at {step[joint] / PERIOD_S:.1f} rad/s: the path is too close to "
@@ -269,8 +285,8 @@ def follow(arm: Arm, moves: Sequence[Move], begin: Callable[[int], None] = lambd
         ScriptError: a target, or a pose on the way, cannot be reached.
     """
     for move in moves:
-        if not (move.speed > 0 and move.acceleration > 0 and all(map(math.isfinite, move.target))):
-            raise ScriptError("move: speed and acceleration must be positive, and all numbers finite")
+        if not (move.speed >= _SLOWEST and move.acceleration >= _SLOWEST):
+            raise ScriptError(f"move: speed and acceleration must be at least {_SLOWEST:g}")
     yield from stop_joints(arm, STOP_DECELERATION_RAD_S2)
     waiting = list(moves)
     active: list[_JointLeg | _LineLeg] = []
@@ -280,7 +296,7 @@ def follow(arm: Arm, moves: Sequence[Move], begin: Callable[[int], None] = lambd
             move = waiting.pop(0)
             # The blend ends by half way, so that a move has come to its own line before the next one begins.
             leg = _leg(arm, move, q_end)
-            q_end = leg.q_goal
+            q_end = arm.waypoint = leg.q_goal
             begin(move.number)
             if leg.duration > 0:
                 active.append(leg)
@@ -342,8 +358,8 @@ def stop_line(arm: Arm, deceleration: float) -> Motion:
 
 def speed_joints(arm: Arm, speed: Array, acceleration: float, time: float) -> Motion:
     """Accelerate the joints to `speed` (6,) [rad/s] and keep it, for `time` [s] or until it is reached. speedj."""
-    if not acceleration > 0 or not np.isfinite(speed).all():
-        raise ScriptError("speedj: the acceleration must be positive, and all speeds finite")
+    if not acceleration > 0:
+        raise ScriptError("speedj: the acceleration must be positive")
     elapsed = 0.0
     while True:
         now = arm.momentum / arm.rate if arm.rate > 0 else np.zeros(6)
@@ -358,8 +374,8 @@ def speed_joints(arm: Arm, speed: Array, acceleration: float, time: float) -> Mo
 
 def speed_line(arm: Arm, speed: Array, acceleration: float, time: float) -> Motion:
     """Accelerate the tool to `speed` (6,) [m/s, rad/s] in base axes and keep it, as `speed_joints`. speedl."""
-    if not acceleration > 0 or not np.isfinite(speed).all():
-        raise ScriptError("speedl: the acceleration must be positive, and all speeds finite")
+    if not acceleration > 0:
+        raise ScriptError("speedl: the acceleration must be positive")
     elapsed = 0.0
     while True:
         now = arm.twist(arm.q, arm.momentum) / arm.rate if arm.rate > 0 else np.zeros(6)
@@ -380,8 +396,8 @@ def servo_joints(arm: Arm, q: Array, time: float, lookahead: float, gain: float)
     A critically damped second-order lag whose time constant is half the look-ahead at the usual gain of 300; speed and
     acceleration stay within those of the joints. The real controller's filter is not public.
     """
-    if not np.isfinite(q).all() or not lookahead > 0 or not gain > 0:
-        raise ScriptError("servoj: look-ahead time and gain must be positive, and all angles finite")
+    if not lookahead > 0 or not gain > 0:
+        raise ScriptError("servoj: look-ahead time and gain must be positive")
     omega = 2 / max(lookahead, 0.03) * math.sqrt(min(gain, 2000.0) / 300)
     elapsed = 0.0
     while True:
@@ -498,7 +514,7 @@ def _leg(arm: Arm, move: Move, q_start: Array) -> _JointLeg | _LineLeg:
         q_goal = arm.inverse(T_goal, q_start)
     else:
         q_goal = np.array(move.target)
-        if (np.abs(q_goal) > kinematics.JOINT_LIMIT).any():
+        if not (np.abs(q_goal) <= kinematics.JOINT_LIMIT).all():
             raise ScriptError(f"move: {np.round(q_goal, 3).tolist()} is outside the joint limits")
         T_goal = arm.forward(q_goal)
     if move.straight:

@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
-from sim_twin.wire.ur_motion import Move, ScriptError
+from sim_twin.wire.ur_motion import Move, ScriptError, checked
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -163,7 +163,7 @@ def number_of(statement: Statement, index: int, name: str, default: float | None
     """
     value = argument(statement, index, name, default)
     if isinstance(value, (bool, int, float)):
-        return float(value)
+        return checked(float(value))
     raise ScriptError(f"line {statement.line}: {statement.name}: {name} must be a number")
 
 
@@ -181,7 +181,7 @@ def numbers_of(statement: Statement, index: int, name: str, count: int) -> tuple
     for number in numbers:
         if not isinstance(number, (int, float)):
             raise ScriptError(f"line {statement.line}: {statement.name}: {name} must be {count} numbers")
-        result.append(float(number))
+        result.append(checked(float(number)))
     return tuple(result)
 
 

@@ -1,18 +1,16 @@
-"""How well the served UR controller keeps its 500 Hz. Run it: python -m tests.benchmarks.wire_rate [seconds] [--cell].
+"""How well the served UR controller keeps its 500 Hz. Run it: python -m tests.benchmarks.wire_rate [seconds].
 
-The arm is a perfect one, so this is the server alone; with --cell it is the whole served cell, ten objects and all.
+The arm is a perfect one, so this is the server alone; `wire_cell` measures the whole cell.
 Three clients: one reads every variable but the registers and does the timing, one only reads the time, and one sends
 servo commands to the control loop at 500 Hz.
 """
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
@@ -22,27 +20,9 @@ from tests.sim_twin.wire.control_script import CONTROL_SCRIPT
 from tests.sim_twin.wire.plant import START_Q, ServedController
 from tests.sim_twin.wire.rtde_client import RtdeClient, reading
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
 _HOST = "127.0.0.18"
 _NAMES = [name for name in OUTPUTS if "register" not in name]
 _SERVO = 11
-
-
-@contextlib.contextmanager
-def _served(whole: bool) -> Iterator[int]:
-    """Serve; gives the process of the controller."""
-    if not whole:
-        with ServedController(_HOST) as served:
-            yield served.process.pid or 0
-        return
-    from robotcell.config import CellConfig
-    from sim_twin.wire.serve import ServedCell
-
-    config = CellConfig.model_validate({"backend": {"name": "twin", "options": {"scene": "random"}}})
-    with ServedCell(config, host=_HOST) as cell:
-        yield cell.processes["ur"]
 
 
 def _servo(ended: threading.Event) -> None:
@@ -61,13 +41,13 @@ def _servo(ended: threading.Event) -> None:
             time.sleep(max(0.0, deadline - time.monotonic()))
 
 
-def main(seconds: float, whole: bool) -> None:
+def main(seconds: float) -> None:
     """Measure and print."""
-    with _served(whole) as pid, reading(_HOST, *_NAMES) as reader, reading(_HOST, "timestamp"):
+    with ServedController(_HOST) as served, reading(_HOST, *_NAMES) as reader, reading(_HOST, "timestamp"):
         ended = threading.Event()
         servo = threading.Thread(target=_servo, args=(ended,))
         servo.start()
-        process = psutil.Process(pid)
+        process = psutil.Process(served.process.pid)
         for _ in range(250):
             reader.package()
         process.cpu_percent()
@@ -95,4 +75,4 @@ def main(seconds: float, whole: bool) -> None:
 
 
 if __name__ == "__main__":
-    main(float(next((word for word in sys.argv[1:] if word[0].isdigit()), 10.0)), "--cell" in sys.argv)
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)

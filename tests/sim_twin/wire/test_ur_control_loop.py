@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from robotcell import kinematics
 from sim_twin.wire.ur_controller import RuntimeState, SafetyMode
 from sim_twin.wire.ur_motion import Move
 from sim_twin.wire.ur_pose import matrix_to_pose, pose_to_matrix
+from sim_twin.wire.ur_snapshot import Snapshot
+from sim_twin.wire.ur_variables import OUTPUTS
 from tests.sim_twin.wire.plant import START_Q
 from tests.sim_twin.wire.ur_rig import LoopRig
 
@@ -303,3 +307,44 @@ def test_every_command_can_be_repeated(rig: LoopRig) -> None:
         assert rig.call(MOVE_J, [*GOAL, 2.0, 10.0], [0])
         assert rig.call(MOVE_J, [*START, 2.0, 10.0], [0])
     np.testing.assert_allclose(rig.q, START)
+
+
+def test_the_way_point_is_that_of_the_move_under_way(rig: LoopRig) -> None:
+    pose = above(START, 0.05)
+    assert rig.call(MOVE_L, [*pose, 0.1, 1.0], [1])
+    rig.seconds(0.1)
+    np.testing.assert_allclose(rig.answer(28), pose, atol=1e-6)
+
+
+NUMBERS = st.one_of(st.floats(), st.floats(-4, 4), st.sampled_from([0.0, 1.0, 0.1, 1e-9, *START_Q]))
+COMMANDS = st.sampled_from([*range(1, 5), *range(6, 13), 15, 16, *range(17, 22), *range(24, 72), 254, 255, -1])
+
+
+@given(
+    st.lists(
+        st.tuples(COMMANDS, st.lists(NUMBERS, min_size=18, max_size=18), st.lists(st.integers(-2, 3), max_size=7)),
+        min_size=1,
+        max_size=4,
+    )
+)
+@settings(max_examples=60)
+def test_no_command_takes_the_controller_down(calls: list[tuple[int, list[float], list[int]]]) -> None:
+    rig = LoopRig()
+    controller = rig.controller
+    path = [rig.q]
+    for command, doubles, ints in calls:
+        rig.set(command, doubles, ints)
+        for _ in range(20):
+            rig.tick()
+            path.append(controller.arm.q)
+        rig.set(0)
+        rig.tick(2)
+        path.append(controller.arm.q)
+        # Everything that can be asked for can be sent.
+        snapshot = Snapshot(controller)
+        assert np.isfinite(
+            [value for name in OUTPUTS for value in np.ravel(snapshot[name]) if "input" not in name]
+        ).all()
+    steps = np.abs(np.diff(np.array(path), axis=0))
+    # Half more than the fastest joint, for two periods.
+    assert steps.max() <= 2 * 1.5 * kinematics.MAX_JOINT_SPEED * 0.002 + 1e-9
