@@ -65,7 +65,8 @@ def test_joint_motion_returns_at_once_and_arrives(cell: Cell) -> None:
     assert cell.arm.moving
     finish(cell)
     # 0.3 rad with ramps of 1.4 rad/s^2 never reach 1 rad/s: 2 sqrt(0.3 / 1.4) s.
-    assert cell.clock.now() - begin == pytest.approx(2 * np.sqrt(0.3 / 1.4), abs=0.1)
+    # In real time a busy machine may hold the motion up, and never hurries it.
+    assert 2 * np.sqrt(0.3 / 1.4) - 0.1 < cell.clock.now() - begin < 2 * np.sqrt(0.3 / 1.4) + 1.0
     np.testing.assert_allclose(cell.arm.state().q, target, atol=2e-3)
     np.testing.assert_allclose(cell.arm.state().qd, 0, atol=0.02)
 
