@@ -7,10 +7,13 @@ for a client or for the world.
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import os
 import select
 import signal
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,6 +83,9 @@ def serve_ur(
         ready: where the endpoints go, or {"error": text} when a port cannot be opened.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The library of inverse kinematics writes warnings to standard output; who does not read them must not hold us up.
+    with Path(os.devnull).open("wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
     server = _Server(host, q, faults)
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     command, state = Record(ARM_COMMAND, arm_command), Record(CELL_STATE, cell_state)
@@ -351,7 +357,9 @@ class _Server:
             for client in list(port.clients):
                 self._drop(port, client)
         elif port.listener is None:
-            port.open()
+            # Where somebody else has taken it meanwhile, it is tried again in the next period.
+            with contextlib.suppress(ConfigError):
+                port.open()
 
 
 def _launch(controller: Controller, script: Script) -> None:
@@ -363,6 +371,7 @@ def _launch(controller: Controller, script: Script) -> None:
     if script.is_control_loop:
         controller.start(ControlLoop(controller, script.register_offset, script.path()).program)
     elif script.secondary:
-        run_at_once(controller, script.statements())
+        if controller.listens():
+            run_at_once(controller, script.statements())
     else:
         controller.start(Program(script.name, run_statements(controller, script.statements())))

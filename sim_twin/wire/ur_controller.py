@@ -244,10 +244,15 @@ class Controller:
 
     # What the program is told
 
-    def start(self, program: Program) -> bool:
-        """Run a program instead of the one that runs; whether the controller takes it."""
+    def listens(self) -> bool:
+        """Whether scripts from outside are taken."""
         if not self.remote:
             self.note("Program rejected", "the robot is in local control: switch the pendant to remote control")
+        return self.remote
+
+    def start(self, program: Program) -> bool:
+        """Run a program instead of the one that runs; whether the controller takes it."""
+        if not self.listens():
             return False
         if not self.powered or not self.safe:
             self.note("Program rejected", f"the robot is in {self.robot_mode.name}, {self.safety_mode.name}")

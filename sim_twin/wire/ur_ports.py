@@ -14,7 +14,8 @@ _SEND_BUFFER = 64 * 1024
 # Answers are never dropped; a client that asks and asks and never reads is closed instead.
 _MAX_WAITING_ANSWERS = 1000
 _MAX_CLIENTS = 32
-_READ_SIZE = 64 * 1024
+# So little at a time that a client that floods its connection cannot hold up the period.
+_READ_SIZE = 4096
 
 
 class Session(Protocol):

@@ -115,7 +115,8 @@ def joint_mode(controller: Controller) -> int:
 def _robot_status_bits(controller: Controller) -> int:
     powered = RobotMode.POWER_ON <= controller.robot_mode <= RobotMode.RUNNING
     running = controller.runtime in (RuntimeState.PLAYING, RuntimeState.PAUSING, RuntimeState.RESUMING)
-    return powered << 0 | running << 1 | controller.arm.freedrive << 2 | powered << 3
+    # Bit 3, the power button, is let go.
+    return powered << 0 | running << 1 | controller.arm.freedrive << 2
 
 
 def _list(vector: Array) -> list[float]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotcell import kinematics
@@ -206,6 +206,7 @@ def test_the_speed_slider_slows_the_arm() -> None:
 
 
 @given(st.lists(st.sampled_from([0.0, 0.1, 0.5, 1.0, "pause", "play"]), min_size=1, max_size=8))
+@settings(max_examples=25)
 def test_whatever_the_operator_does_the_joints_keep_their_limits(deeds: list[float | str]) -> None:
     rig = LoopRig()
     assert rig.call(MOVE_J, [*(START + np.array([1.0, 0.5, 0, 0, 0, 0])), 1.5, 5.0], [1])

@@ -295,33 +295,21 @@ def test_the_realtime_stream_has_its_layout(served: ServedController) -> None:
 # Safety
 
 
-def test_a_push_pauses_the_program_and_the_dashboard_frees_the_arm(served: ServedController) -> None:
-    client, recipe, script = loop_client()
-    with client, script, Dashboard() as dashboard, reading(HOST, "safety_mode", "runtime_state") as reader:
-        client.write(recipe, 9, 0.1, 0, 0, 0, 0, 0, 1.0, 0.004, 0, 0, 0)
-        wait_for(lambda: bool(served.q[0] > 0.005))
-        served.push[:] = [0, 0, 200]
-        wait_for(lambda: reader.newest()["safety_mode"] == 3)
-        assert reader.newest()["runtime_state"] == 4
-        served.push[:] = 0
-        assert dashboard.ask("unlock protective stop").startswith("Cannot unlock")
-        time.sleep(5.1)
-        assert dashboard.ask("close safety popup") == "closing safety popup"
-        assert dashboard.ask("unlock protective stop") == "Protective stop releasing"
-        assert dashboard.ask("safetymode") == "Safetymode: NORMAL"
-        assert dashboard.ask("programState") == "PAUSED rtde_control"
-
-
-def test_two_cells_move_at_once(served: ServedController) -> None:
-    with ServedController(OTHER) as other:
-        clients = []
+def test_two_cells_move_at_once_and_a_push_stops_only_the_one_that_is_pushed(served: ServedController) -> None:
+    with ServedController(OTHER) as other, contextlib.ExitStack() as stack:
         for host, angle in ((HOST, 0.2), (OTHER, -0.2)):
             client, recipe, script = loop_client(host)
-            clients += [client, script]
+            stack.enter_context(client)
+            stack.enter_context(script)
             client.write(recipe, 1, angle, *START_Q[1:], 2.0, 10.0, 0, 0, 0)
         wait_for(lambda: bool(abs(served.q[0] - 0.2) < 1e-9 and abs(other.q[0] + 0.2) < 1e-9))
-        for connection in clients:
-            connection.close()
+        names = ("safety_mode", "runtime_state")
+        here, there = (stack.enter_context(reading(host, *names)) for host in (HOST, OTHER))
+        other.push[:] = [0, 0, 200]
+        wait_for(lambda: list(there.newest().values()) == [3, 4])
+        assert list(here.newest().values()) == [1, 2]
+        other.push[:] = 0
+        assert stack.enter_context(Dashboard(OTHER)).ask("unlock protective stop").startswith("Cannot unlock")
 
 
 # Faults of the links
@@ -458,3 +446,16 @@ def test_sigterm_ends_it_with_clients_connected() -> None:
         assert served.process.exitcode == 0
         with pytest.raises(ConnectionError):
             _read_on(client)
+
+
+def test_a_client_that_floods_its_connection_does_not_hold_up_the_period(served: ServedController) -> None:
+    with reading(HOST, "timestamp") as good, contextlib.closing(socket.create_connection((HOST, RTDE))) as flood:
+        flood.setblocking(False)
+        begin = time.monotonic()
+        count = 0
+        while time.monotonic() < begin + 1.0:
+            with contextlib.suppress(BlockingIOError):
+                flood.send(b"\x00\x03M" * 10_000)
+            good.package()
+            count += 1
+    assert count > 100
