@@ -55,7 +55,7 @@ WHILE_CONNECTING = [
 ]
 LIMIT_S = 20.0
 # A second is what the driver waits for; the machine may be busy.
-SOON_S = 4.0
+SOON_S = 10.0
 
 
 @pytest.fixture(scope="module")
