@@ -7,6 +7,7 @@ interpreter's lock. From the moment it is gone nobody kicks the controller's wat
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -66,7 +67,8 @@ _MOTION_BEGINS_S = 0.5
 _LAST_STOP_S = 0.6
 # What ur_rtde brakes with unless told otherwise [m/s^2].
 _STOP_DECELERATION_M_S2 = 10.0
-_STANDS_RAD_S = 0.01
+_STANDS_RAD_S = 0.015
+_SETTLES_S = 0.2
 # The offset between two clocks is the smallest that was seen in this and the previous period of so many seconds: it
 # drifts by less than a millisecond in that time.
 _OFFSET_PERIOD_S = 10.0
@@ -113,6 +115,7 @@ class _Session:
         # Number of the operation before the one that moves the arm or brakes it, and when that was commanded.
         self._operation = 0
         self._commanded_at = 0.0
+        self._ended_at = math.inf
         self._stops = 0
         self._stop_sent = False
         self._kick_due = 0.0
@@ -218,7 +221,13 @@ class _Session:
         elif self._moving:
             status = self._control.getAsyncOperationProgressEx()
             if status.operationId() != self._operation:
-                self._moving = bool(status.isAsyncOperationRunning())
+                if status.isAsyncOperationRunning():
+                    self._ended_at = math.inf
+                else:
+                    # The joints follow their targets with a delay: the motion ends when they stand.
+                    self._ended_at = min(self._ended_at, time.monotonic())
+                    settled = max(map(abs, qd)) < _STANDS_RAD_S
+                    self._moving = not settled and time.monotonic() - self._ended_at < _SETTLES_S
             elif time.monotonic() - self._commanded_at > _MOTION_BEGINS_S:
                 leave("the controller took a motion and did not begin it")
 
@@ -236,7 +245,7 @@ class _Session:
         if not taken:
             return "the controller did not take the motion"
         self._operation, self._commanded_at = operation, time.monotonic()
-        self._moving, self._stop_sent = True, False
+        self._moving, self._stop_sent, self._ended_at = True, False, math.inf
         self._state.write(moving=True)
         return ""
 

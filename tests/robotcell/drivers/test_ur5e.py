@@ -43,11 +43,19 @@ if TYPE_CHECKING:
     from sim_twin.wire.serve import ServedCell
 
 HOST, NUMBER = "127.0.0.45", 45
+SECOND_HOST, SECOND_NUMBER = "127.0.0.44", 44
 
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[ServedCell]:
     with served_arm(HOST, NUMBER) as cell:
+        yield cell
+
+
+@pytest.fixture(scope="module")
+def second() -> Iterator[ServedCell]:
+    """A cell that is not whole afterwards."""
+    with served_arm(SECOND_HOST, SECOND_NUMBER) as cell:
         yield cell
 
 
@@ -240,3 +248,12 @@ def test_a_protective_stop_is_left_only_by_recover(served: ServedCell, arm: UR5e
     arm.stop()
     keep_moving(arm, 2.0)
     go_home(arm)
+
+
+def test_the_arm_stands_when_the_controller_dies(second: ServedCell) -> None:
+    with make_arm(SECOND_HOST) as arm:
+        start_descent(arm)
+        assert stands_after(second, lambda: os.kill(second.processes["ur"], signal.SIGKILL)) < STANDS_S
+        assert is_lost(arm) < LOST_S
+        with pytest.raises(ConnectionLost, match="refused"):
+            arm.connect()
