@@ -30,6 +30,7 @@ FLOOR = 1e-6
 _MAX_ITERATIONS = 100
 _CONVERGED = 1e-7
 _CONVERGED_WEIGHTS = 1e-3
+_RESTART = 0.01
 _MAX_REJECTIONS = 20
 # Median and mean square of the length of three standard normal numbers (chi with three degrees of freedom).
 _CHI3_MEDIAN = float(np.sqrt(chi2.ppf(0.5, 3)))
@@ -141,6 +142,7 @@ def refine(
     *,
     scale: float = 1.0,
     free_scale: bool = False,
+    variances: Array | None = None,
 ) -> Fit:
     """Refine X, Z and the variances of the noise on the used views.
 
@@ -153,8 +155,11 @@ def refine(
         used: (V,) bool.
         scale: factor on the translations of C, start.
         free_scale: estimate it.
+        variances: (K,) of a fit to nearly the same views, to start from.
     """
-    variances = np.maximum(_first_variances(predict(X, Z, M), _scaled(C, scale), noise, used), noise.floors)
+    first = np.maximum(_first_variances(predict(X, Z, M), _scaled(C, scale), noise, used), noise.floors)
+    # Never from the floor: a variance grows from there by factors, too slowly to be noticed.
+    variances = first if variances is None else np.maximum(variances, _RESTART * first)
     A = np.zeros((13 if free_scale else 12,) * 2)
     for _ in range(_MAX_ITERATIONS):
         e, J = _linearise(X, Z, M, C, scale, free_scale)
@@ -185,13 +190,14 @@ def reject_outliers(
     gates = np.maximum(_GATE * np.median(sizes, axis=0) / _CHI3_MEDIAN, 10 * FLOOR)
     used = (sizes < gates).all(axis=1)
     seen: set[bytes] = set()
+    variances = None
     while True:
-        fit = refine(X, Z, M, C, noise, used, scale=scale, free_scale=free_scale)
+        fit = refine(X, Z, M, C, noise, used, scale=scale, free_scale=free_scale, variances=variances)
         keep = fit.distance < OUTLIER
         if (keep == used).all() or keep.sum() < 4 or keep.tobytes() in seen or len(seen) > _MAX_REJECTIONS:
             return fit
         seen.add(used.tobytes())
-        X, Z, scale, used = fit.X, fit.Z, fit.scale, keep
+        X, Z, scale, used, variances = fit.X, fit.Z, fit.scale, keep, fit.variances
 
 
 def _scaled(C: Array, scale: float) -> Array:

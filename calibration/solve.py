@@ -249,7 +249,7 @@ def _from_poses(M: Array, sight: _Sight, on_the_arm: bool) -> _Candidate:
             X, Z = closed_form(M[fit.used], C[fit.used])
         except ValueError:
             continue
-        candidates.append(_pose_candidate(name, M, sight, refine(X, Z, M, C, noise, fit.used)))
+        candidates.append(_pose_candidate(name, M, sight, refine(X, Z, M, C, noise, fit.used, variances=fit.variances)))
     return _best(candidates)
 
 
