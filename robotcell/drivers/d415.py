@@ -66,7 +66,8 @@ class D415Options(BaseModel):
     source: Annotated[str, Field(pattern=r"^(usb|.+\.db3|[a-z][a-z0-9_-]*://.+)$")] = "usb"
     serial: str | None = None
     spatial_filter: bool = False
-    temporal_frames: Annotated[int, Field(ge=1, le=16)] = 1
+    # They are held until the last has come; librealsense has 16 for everybody.
+    temporal_frames: Annotated[int, Field(ge=1, le=8)] = 1
 
 
 class CameraSource(Protocol):
