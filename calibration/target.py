@@ -161,7 +161,7 @@ def _draw_foot(draw: ImageDraw.ImageDraw, board: CharucoBoard, left: int, top: i
         f"{1000 * along * board.square_m:.1f} mm, both within 0.2 mm.",
         f"If not, divide the measured row by {along} and give it as --square-mm. Glue the sheet flat on a stiff plate, "
         "cut along the line.",
-        "This edge, with a tab of 20 x 30 mm at its middle, goes to the gripper.",
+        "The edge above the ruler, with a tab of 20 x 30 mm at its middle, goes to the gripper.",
     )
     x, y = left, y + _px(6)
     for line in lines:
