@@ -231,7 +231,11 @@ class _Server:
         connection = port.accept()
         if connection is None:
             return
-        client = Client(connection, self._session(port))
+        try:
+            client = Client(connection, self._session(port))
+        except OSError:
+            connection.close()
+            return
         client.outbox.delay_s = self._delay_s(port)
         port.clients.append(client)
         if port is self._dashboard:
@@ -276,11 +280,10 @@ class _Server:
 
     def _send(self, now: float, snapshot: Snapshot) -> None:
         controller = self._controller
-        if not self._stuck(self._rtde):
-            slow = self._inbox.find("rtde", Kind.SLOW)
-            tick = controller.ticks if slow is None else controller.ticks * min(max(slow.value or 0.1, 1e-3), 1.0)
-            if tick == int(tick):
-                self._send_packages(now, snapshot, int(tick))
+        slow = self._inbox.find("rtde", Kind.SLOW)
+        every = 1 if slow is None else max(1, round(1 / max(slow.value or 0.1, 1e-3)))
+        if not self._stuck(self._rtde) and controller.ticks % every == 0:
+            self._send_packages(now, snapshot, controller.ticks // every)
         self._send_streams(now, snapshot)
         for port in self._ports:
             if self._stuck(port):
@@ -314,7 +317,8 @@ class _Server:
             message = robot_state(controller, snapshot) if streams else b""
             for client in streams:
                 client.outbox.put(message, now, droppable=True)
-        readers = [client for port in self._realtime for client in port.clients if not client.outbox.blocked]
+        ports = [port for port in self._realtime if not self._stuck(port)]
+        readers = [client for port in ports for client in port.clients if not client.outbox.blocked]
         packet = realtime_packet(snapshot) if readers else b""
         for client in readers:
             client.outbox.put(packet, now, droppable=True)

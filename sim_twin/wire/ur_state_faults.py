@@ -62,9 +62,12 @@ class StateFaults:
         """Bring the controller into line with what is injected now."""
         controller = self._controller
         active = frozenset(what for what in STATE_FAULTS if inbox.find("state", Kind.WRONG, what))
+        begun = active - self._active
         if any(what in _CONDITIONS for what in self._active - active):
             controller.restore()
-        for what in sorted(active - self._active):
+            # Those that stay hold on.
+            begun = begun | (active & _CONDITIONS.keys())
+        for what in sorted(begun):
             act = _CONDITIONS.get(what) or _EVENTS.get(what)
             if act is not None:
                 act(controller)

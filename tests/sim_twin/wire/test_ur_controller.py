@@ -469,6 +469,13 @@ def test_a_fault_of_the_state_stops_the_arm(
     assert controller.start(LoopRig().loop.program)
 
 
+def test_a_condition_holds_on_when_another_one_is_lifted(rig: LoopRig, inject: Injector) -> None:
+    inject.set("power_off", "emergency_stop")
+    assert rig.controller.safety_mode is SafetyMode.ROBOT_EMERGENCY_STOP
+    inject.set("power_off")
+    assert (rig.controller.robot_mode, rig.controller.safety_mode) == (RobotMode.POWER_OFF, SafetyMode.NORMAL)
+
+
 def test_a_move_that_never_arrives(rig: LoopRig, inject: Injector) -> None:
     inject.set("never_arrives")
     rig.seconds(10)
