@@ -9,6 +9,7 @@ Nothing resumes by itself: a program that was interrupted is ended, and only `re
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import time
 from contextlib import suppress
@@ -28,7 +29,7 @@ from robotcell.drivers.ur_controller import (
     slow_slider,
     why_not_ready,
 )
-from robotcell.errors import CellError, ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.errors import CellError, ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import make_transform, matrix_to_rotvec, rotvec_to_matrix
 from robotcell.interfaces import Arm, ArmMode, ArmState
 
@@ -89,12 +90,15 @@ class UR5e(Arm):
         Raises:
             ConnectionLost: the controller cannot be reached, or does not answer.
             DeviceFault: it must be changed at the pendant first; the message lists everything, with the cures.
+            ConfigError: ur_rtde is not installed.
         """
         if self._child is not None:
             with suppress(ConnectionLost):
                 self._record()
                 return
         self.close()
+        if importlib.util.find_spec("rtde_control") is None:
+            raise ConfigError("ur_rtde is not installed: pip install 'robotcell[hardware]'")
         _warn_unconfirmed()
         try:
             controller, held = self._inspect_idle()
