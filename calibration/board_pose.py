@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 # Fewer, or corners on one line, leave the tilt to chance.
 MIN_CORNERS = 6
 _MIN_WIDTH = 0.05
+_MIN_WIDTH_PX = 2.0
 _ITERATIONS = 20
 _CONVERGED = 1e-10
+_DAMPING = 1e-12
 # The two poses under which a flat board looks alike differ in their residuals by little when it is far away.
 _AMBIGUOUS = 1.5
 _FLAT_M = 1e-6
@@ -48,12 +50,14 @@ class BoardPoses:
 
 
 def usable_corners(stack: CornerStack) -> npt.NDArray[np.bool_]:
-    """(V,) bool: enough corners, and not all on one line."""
+    """(V,) bool: enough corners, not all on one line, neither on the board nor in the image."""
     usable = np.zeros(len(stack.px), dtype=bool)
-    for i, (points, seen) in enumerate(zip(stack.points, stack.seen > 0, strict=True)):
+    for i, (points, px, seen) in enumerate(zip(stack.points, stack.px, stack.seen > 0, strict=True)):
         if seen.sum() >= MIN_CORNERS:
-            widths = np.linalg.svd(points[seen] - points[seen].mean(axis=0), compute_uv=False)
-            usable[i] = widths[1] > _MIN_WIDTH * widths[0]
+            on_board = np.linalg.svd(points[seen] - points[seen].mean(axis=0), compute_uv=False)
+            in_image = np.linalg.svd(px[seen] - px[seen].mean(axis=0), compute_uv=False)
+            wide_px = in_image[1] / np.sqrt(seen.sum())
+            usable[i] = on_board[1] > _MIN_WIDTH * on_board[0] and wide_px > _MIN_WIDTH_PX
     return usable
 
 
@@ -91,6 +95,8 @@ def refine_poses(stack: CornerStack, intrinsics: Array, start: Array) -> BoardPo
         weight = corner_weights(residual, stack.seen, sigma)
         information = np.einsum("vk,vkip,vkiq->vpq", weight, J, J, optimize=True)
         gradient = np.einsum("vk,vkip,vki->vp", weight, J, residual, optimize=True)
+        # False corners can leave a pose without any hold; the others are not moved by so little.
+        information += _DAMPING * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(6)
         step = np.linalg.solve(information, gradient[..., None])[..., 0]
         T = change(T, step)
         if np.abs(step).max() < _CONVERGED:

@@ -450,7 +450,11 @@ def _unusable(views: Views) -> list[str]:
     usable = usable_corners(stack)
     for i in np.flatnonzero(~usable):
         count = len(views.corners[i].ids)
-        why[i] = f"{count} corners; {MIN_CORNERS} are needed" if count < MIN_CORNERS else "its corners lie on one line"
+        why[i] = (
+            f"{count} corners; {MIN_CORNERS} are needed"
+            if count < MIN_CORNERS
+            else "its corners lie on one line or in one spot"
+        )
     index = np.flatnonzero(usable)
     found = np.isfinite(start_poses(stack.subset(index), intrinsics_vector(views.camera))).all(axis=(1, 2))
     for i in index[~found]:

@@ -148,7 +148,7 @@ class HeldOutErrors(_Record):
     """What a view that took no part in the solving is off by.
 
     Attributes:
-        mm: distance between the board's origin as seen by the camera and as carried by the arm [mm].
+        mm: distance between the board's centre as seen by the camera and as carried by the arm [mm].
         deg: angle between the two [degrees].
         px: corners as seen and as predicted from the arm's pose, root mean square of a view [px]; None without corners.
     """

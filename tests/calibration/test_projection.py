@@ -91,8 +91,9 @@ def test_too_few_corners_and_corners_on_a_line_are_unusable() -> None:
     full = views.corners[0]
     few = Corners(full.ids[:5], full.px[:5])
     line = Corners(np.arange(6), np.column_stack([np.arange(6) * 40.0, np.full(6, 200.0)]))
-    stack = stack_corners((full, few, line), BOARD.corners())
-    assert usable_corners(stack).tolist() == [True, False, False]
+    dot = Corners(full.ids, np.full_like(full.px, 300.0))
+    stack = stack_corners((full, few, line, dot), BOARD.corners())
+    assert usable_corners(stack).tolist() == [True, False, False, False]
 
 
 def test_points_off_a_plane_have_a_pose_too() -> None:
