@@ -21,6 +21,7 @@ from robotcell.drivers.realsense import (
     sdk_errors,
     serial_number,
 )
+from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Camera, RgbdFrame
 
@@ -124,6 +125,8 @@ class D415(Camera):
         """
         if self._images is not None:
             return
+        if self._options.source == "usb":
+            warn_unconfirmed("D415")
         try:
             self._connect()
         except BaseException:

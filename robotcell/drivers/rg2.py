@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 from pydantic import BaseModel, ConfigDict, Field
 
 from robotcell import linkage
+from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.interfaces import Gripper, GripperState
 
@@ -118,6 +119,7 @@ class RG2(Gripper):
         """
         if self._client is not None:
             return
+        warn_unconfirmed("RG2")
         self._open()
         try:
             (product,) = self._read(_PRODUCT, 1, "its product code")

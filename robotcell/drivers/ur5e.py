@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from robotcell import linkage
 from robotcell.arm_checks import check_joint_motion, check_line, check_linear_motion
 from robotcell.drivers.dashboard import Dashboard
+from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.drivers.ur5e_link import ChildProcess, Setup, StartJoints, StartLinear
 from robotcell.drivers.ur_controller import (
     arm_mode,
@@ -99,7 +100,7 @@ class UR5e(Arm):
         self.close()
         if importlib.util.find_spec("rtde_control") is None:
             raise ConfigError("ur_rtde is not installed: pip install 'robotcell[hardware]'")
-        _warn_unconfirmed()
+        warn_unconfirmed("UR5e")
         try:
             controller, held = self._inspect_idle()
             self._check(controller)
@@ -329,16 +330,3 @@ class UR5e(Arm):
 
 def _mode(record: np.void) -> ArmMode:
     return arm_mode(int(record["robot_mode"]), int(record["safety_mode"]), ready=bool(record["ready"]))
-
-
-_warned = False
-
-
-def _warn_unconfirmed() -> None:
-    global _warned  # noqa: PLW0603
-    if not _warned:
-        _LOG.warning(
-            "the UR5e driver was verified against the served twin only, not yet against an arm: follow 'first motion' "
-            "in docs/hardware.md"
-        )
-    _warned = True
