@@ -15,7 +15,7 @@ from calibration.verification import Touch, Verification, choose_spots, go_above
 from cli.console import progress, report_error, results
 from robotcell.cell import Cell, open_cell
 from robotcell.config import CellConfig, load_config
-from robotcell.errors import CellError, ConfigError
+from robotcell.errors import CalibrationError, CellError, ConfigError
 from robotcell.safety import check_config
 
 if TYPE_CHECKING:
@@ -34,6 +34,9 @@ def run_verify(cell_file: Path | None, points: int, *, touch: bool, yes: bool, a
         alone = yes or config.backend.name == _TWIN
         with open_cell(config) as cell:
             verification = _verify(cell, points, touch=touch, alone=alone)
+    except CalibrationError as error:
+        report_error(error)
+        return _NOT_GOOD
     except CellError as error:
         return report_error(error)
     problems = verification.problems(config)
