@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
 .PHONY: demo test test-wire check bench setup clean
 
 demo: setup
-	$(BIN)/robotcell pick --goal red
+	$(BIN)/robotcell pick --goal red --cell examples/cell.toml
 
 test: setup
 	$(BIN)/python -m pytest

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from calibration.detection import Detection, average, draw
 from robotcell.errors import DeviceFault
+from robotcell.geometry import make_transform
 from robotcell.primitives import flange_pose
 
 if TYPE_CHECKING:
@@ -41,8 +43,8 @@ class Shot:
         depth_m: (H, W) float32, median of the returns of its frames, 0 = none.
         intrinsics: of both images.
         serial: of the camera; None where it is not known.
-        q: (6,) joint angles [rad].
-        T_base_tcp: pose of the tool centre point as the arm reports it (4, 4).
+        q: (6,) joint angles [rad], mean over its frames.
+        T_base_tcp: pose of the tool centre point as the arm reports it (4, 4), likewise.
         detection: the board in it.
     """
 
@@ -74,15 +76,19 @@ def take_shot(cell: Cell, detector: Detector) -> Shot:
         DeviceFault: the arm does not come to rest.
         ConnectionLost, DeviceFault: as arm and camera do.
     """
-    before = wait_for_standstill(cell)
-    frames = [cell.camera.read() for _ in range(FRAMES)]
-    after = cell.arm.state()
+    wait_for_standstill(cell)
+    # An arm at rest trembles a little: the mean pose of the moments of the images belongs to their mean.
+    frames, states = [], []
+    for _ in range(FRAMES):
+        frames.append(cell.camera.read())
+        states.append(cell.arm.state())
+    q = np.array([state.q for state in states])
     seen = [detector.detect(frame.color) for frame in frames]
     corners, wander_px = average([detection.corners for detection in seen])
     refused = detector.refuse(corners)
     if not refused and wander_px > _WANDER_PX:
         refused = f"the corners moved by {wander_px:.1f} px during the shot: is the board, or the camera, loose?"
-    moved = float(np.abs(after.q - before.q).max())
+    moved = float(np.ptp(q, axis=0).max())
     if moved > _STILL_RAD:
         refused = f"a joint moved by {1000 * moved:.1f} mrad during the shot"
     depths = np.stack([frame.depth_m for frame in frames])
@@ -93,8 +99,8 @@ def take_shot(cell: Cell, detector: Detector) -> Shot:
         depth_m=_median(depths),
         intrinsics=frames[-1].intrinsics,
         serial=frames[-1].serial,
-        q=after.q,
-        T_base_tcp=after.T_base_tcp,
+        q=q.mean(axis=0),
+        T_base_tcp=_mean([state.T_base_tcp for state in states]),
         detection=Detection(corners, refused),
     )
 
@@ -118,6 +124,12 @@ def wait_for_standstill(cell: Cell) -> ArmState:
             raise DeviceFault(
                 f"the arm does not come to rest within {_PATIENCE_S:.0f} s: hold it still, then try again"
             )
+
+
+def _mean(poses: list[Array]) -> Array:
+    """The mean (4, 4) of poses that hardly differ."""
+    stack = np.stack(poses)
+    return make_transform(Rotation.from_matrix(stack[:, :3, :3]).mean().as_matrix(), stack[:, :3, 3].mean(axis=0))
 
 
 def _median(depths: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
