@@ -35,8 +35,8 @@ def errors(case, seed):
         seed, count, mount=mount, corner_px=corner_px, position_m=position_m, rotation_rad=rotation_rad
     )
     if poses:
+        # The board where the arm states that it is, seen with noise: the arm's own errors play no part.
         views = as_poses(views, truth, seed=seed, position_m=0.0003, rotation_rad=0.0005)
-        # The arm's noise is in the poses already; here its poses are exact, and the camera's are not.
     solution = solve(views)
     estimate = solution.estimate
     return difference(estimate.X, truth.X), estimate.covariance, solution.rejected
@@ -57,7 +57,7 @@ def main() -> None:
         z = np.abs(e) / np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
         mount, count, corner_px, position_m, rotation_rad, poses = case
         seen = "poses" if poses else f"{corner_px:.2f}"
-        arm = f"{1e3 * position_m:.1f}, {1e3 * rotation_rad:.1f}"
+        arm = "-" if poses else f"{1e3 * position_m:.1f}, {1e3 * rotation_rad:.1f}"
         mm = 1e3 * np.median(np.linalg.norm(e[:, :3], axis=1))
         deg = np.rad2deg(np.median(np.linalg.norm(e[:, 3:], axis=1)))
         whole = [100 * np.mean(d2 < chi2.ppf(level, 6)) for level in (0.68, 0.95)]
