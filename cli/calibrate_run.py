@@ -85,8 +85,8 @@ def run_calibrate(
                     # The arm is back where it was, so it hides what it hid then.
                     check_tags(cell.camera.read().color, tags)
             finally:
-                follower.end(len(read_session(folder)))
-        return _conclude(folder, out, tags, err)
+                follower.end(len(read_session(folder)), views)
+        return _conclude(folder, out, tags, cell_file, err)
     except CalibrationError as refusal:
         report_error(refusal)
         return _REFUSED
@@ -174,7 +174,7 @@ def _get_ready(cell: Cell, held_by: str, *, yes: bool) -> None:
         Executor(cell).run(check_plan(MotionPlan("hold the board", cell.arm.state().q, (grip,)), cell.config))
 
 
-def _conclude(folder: Path, out: Path, tags: tuple[FixedTag, ...], err: Console) -> int:
+def _conclude(folder: Path, out: Path, tags: tuple[FixedTag, ...], cell_file: Path | None, err: Console) -> int:
     """Solve, report, and write the calibration where it is accepted; returns the exit code."""
     with err.status("solving"):
         solution = solve(read_session(folder))
@@ -189,7 +189,9 @@ def _conclude(folder: Path, out: Path, tags: tuple[FixedTag, ...], err: Console)
         save_calibration(load_calibration(path).model_copy(update={"tags": tags}), path)
     if tags:
         err.print(Text(f"fixed tags in view: {', '.join(str(tag.id) for tag in tags)}"))
-    err.print(Text(f'written: {out}. In cell.toml:\n\n[camera]\ncalibration = "{out}"'), soft_wrap=True)
+    beside = cell_file is not None and out.resolve().parent == cell_file.resolve().parent
+    line = f'calibration = "{out.name if beside else out.resolve().as_posix()}"'
+    err.print(Text(f"written: {out}. In {cell_file or 'cell.toml'}:\n\n[camera]\n{line}"), soft_wrap=True)
     return 0
 
 
@@ -236,9 +238,11 @@ class _Progress:
         words = "Move the arm with the pendant's freedrive button, let go, then press Enter; q and Enter to end"
         return not typer.prompt(words, default="", show_default=False, err=True).strip().lower().startswith("q")
 
-    def end(self, taken: int) -> None:
-        """Say what is kept."""
+    def end(self, taken: int, count: int) -> None:
+        """Say what is kept of a collection that was cut short."""
         self._status.stop()
+        if taken >= count:
+            return
         self._console.print(
             Text(f"{taken} views in {self._folder}; go on there with --resume {self._folder}"), soft_wrap=True
         )

@@ -21,7 +21,15 @@ def test_without_a_file_the_twin_stands_ready() -> None:
 
 def test_the_example_shows_the_defaults() -> None:
     example, default = load_config(EXAMPLE), load_config()
-    assert example.model_dump(exclude={"backend"}) == default.model_dump(exclude={"backend"})
+    of_its_own = {"backend": True, "camera": {"calibration": True}}
+    assert example.model_dump(exclude=of_its_own) == default.model_dump(exclude=of_its_own)
+
+
+def test_a_relative_calibration_file_lies_beside_the_cells_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_config(EXAMPLE).camera.calibration == EXAMPLE.with_name("twin-calibration.json")
 
 
 def test_every_bad_value_is_reported_at_once(tmp_path: Path) -> None:
