@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
-import threading
+import time
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,9 @@ _USES = {
     "control": ("cell", "control socket: faults, JSON lines; robotcell twin fault"),
 }
 _STATUS_S = 1.0
+# A signal is noticed after this.
+_SIGNAL_S = 0.05
+_TWICE_S = 1.0
 
 
 def run_serve(
@@ -64,7 +67,7 @@ def run_serve(
             )
         config = as_twin(cell_file, options)
         served = ServedCell(config, host, **{name: port for name, port in ports.items() if port is not None})
-        ended = _signalled()
+        ending = _Ending()
         with progress().status("building the cell and starting its servers"):
             served.start()
         with served:
@@ -77,7 +80,7 @@ def run_serve(
                     )
                 )
             _print_endpoints(served.endpoints)
-            _watch(served, ended)
+            _watch(served, ending)
     except CellError as error:
         return report_error(error)
     return 0
@@ -115,18 +118,32 @@ def as_twin(cell_file: Path | None, options: Mapping[str, Any]) -> CellConfig:
     return load_config(cell_file, {"backend.name": "twin", "backend.options": {**own, **options}})
 
 
-def _signalled() -> threading.Event:
-    """What SIGINT and SIGTERM set from now on; once it is set, a further one interrupts at once."""
-    ended = threading.Event()
+class _Ending:
+    """Whether SIGINT or SIGTERM came since this was made; one that comes a second later interrupts at once.
 
-    def end(_number: int, _frame: FrameType | None) -> None:
-        if ended.is_set():
+    A plain flag: a signal that comes while the handler of another one runs must find no lock. Some programs
+    (`timeout`, a shell that ends a group) send two at a time.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._asked_at = 0.0
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._ask)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait until a signal comes, but not much longer than so many seconds; whether one came."""
+        end = time.monotonic() + seconds
+        while not self.asked and time.monotonic() < end:
+            time.sleep(_SIGNAL_S)
+        return self.asked
+
+    def _ask(self, _number: int, _frame: FrameType | None) -> None:
+        if self.asked and time.monotonic() - self._asked_at > _TWICE_S:
             raise KeyboardInterrupt
-        ended.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end)
-    return ended
+        if not self.asked:
+            self._asked_at = time.monotonic()
+            self.asked = True
 
 
 def _print_endpoints(endpoints: Mapping[str, str]) -> None:
@@ -137,13 +154,13 @@ def _print_endpoints(endpoints: Mapping[str, str]) -> None:
     results().print(table)
 
 
-def _watch(served: ServedCell, ended: threading.Event) -> None:
+def _watch(served: ServedCell, ending: _Ending) -> None:
     """Show how it goes, until it is to end or a server dies."""
     console = progress()
     before = None
     status = console.status("serving; Ctrl-C ends it", refresh_per_second=2)
     with status if console.is_terminal else nullcontext() as line:
-        while not ended.wait(_STATUS_S):
+        while not ending.wait(_STATUS_S):
             if served.ended:
                 raise ConnectionLost(f"the twin's process {' and '.join(served.ended)} has died: start it again")
             if line is not None:

@@ -40,8 +40,9 @@ class Serving:
     def address(self, word):
         return next(line.split()[-1] for line in self.lines if word in line)
 
-    def end(self, number):
-        os.kill(self.process.pid, number)
+    def end(self, number, times=1):
+        for _ in range(times):
+            os.kill(self.process.pid, number)
         _, errors = self.process.communicate(timeout=LIMIT_S)
         return self.process.returncode, errors
 
@@ -105,6 +106,12 @@ def test_no_control_socket(control, code):
 def test_an_interrupt_ends_it_clean():
     serving = Serving("127.0.0.22")
     assert serving.end(signal.SIGINT) == (0, "")
+    assert all_end(serving.servers)
+
+
+def test_signals_that_come_in_pairs_end_it_clean():
+    serving = Serving("127.0.0.22")
+    assert serving.end(signal.SIGTERM, times=5) == (0, "")
     assert all_end(serving.servers)
 
 
