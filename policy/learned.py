@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
 # the goal's mask is below a threshold).
-_GRASP_THRESHOLD = 0.6
+_GRASP_THRESHOLD = 0.75
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the

@@ -87,7 +87,7 @@ def test_a_doubtful_grasp_waits_for_a_push(network, observation):
 
 
 def test_a_likely_grasp_is_not_delayed(network, observation):
-    put(network.grasp, 5, 110, 115, 0.8)
+    put(network.grasp, 5, 110, 115, 0.9)
     network.push[0, 112, 112] = 1.0
     assert decide(network, observation).primitive is Primitive.GRASP
 
