@@ -61,7 +61,7 @@ def pick(
         int | None, typer.Option(help="Twin: the same seed gives the same job.", show_default=False)
     ] = None,
     policy: Annotated[
-        str | None, typer.Option(help="Who decides: heuristic, learned, grasp-only, random.", show_default=False)
+        str | None, typer.Option(help="Who decides: learned, heuristic, grasp-only, random.", show_default=False)
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Look, decide, plan, check and draw one action; move nothing.")

@@ -199,7 +199,7 @@ class GripperUse(_Table):
 class PolicyChoice(_Table):
     """Which policy decides."""
 
-    name: str = "heuristic"
+    name: str = "learned"
 
 
 class JournalPlace(_Table):

@@ -103,7 +103,7 @@ class TrainConfig(_Table):
     collect: CollectSettings = CollectSettings()
     learning: LearningSettings = LearningSettings()
     stage1: StageSettings = StageSettings(
-        rounds=8,
+        rounds=5,
         scenes_per_round=36,
         updates_per_round=350,
         warmup_rounds=1,
@@ -111,7 +111,7 @@ class TrainConfig(_Table):
         exploration_end=0.1,
     )
     stage2: StageSettings = StageSettings(
-        rounds=8,
+        rounds=4,
         scenes_per_round=24,
         updates_per_round=400,
         warmup_rounds=0,

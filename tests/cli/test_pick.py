@@ -125,7 +125,7 @@ def test_jobs_are_listed_and_shown(cell: Path) -> None:
     assert "complete" in listing.stdout
     shown = run("jobs", "show", "1", "--cell", cell)
     assert shown.exit_code == 0
-    assert "pick blue with heuristic, complete" in shown.stdout
+    assert "pick blue with learned, complete" in shown.stdout
     missing = run("jobs", "show", "9", "--cell", cell)
     assert missing.exit_code == 2
     assert "no job 9" in missing.stderr

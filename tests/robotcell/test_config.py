@@ -16,7 +16,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "cell.toml"
 def test_without_a_file_the_twin_stands_ready() -> None:
     config = load_config()
     assert config.backend.name == "twin"
-    assert config.policy.name == "heuristic"
+    assert config.policy.name == "learned"
 
 
 def test_the_example_shows_the_defaults() -> None:
