@@ -20,7 +20,7 @@ from policy.networks import make_network
 from policy.weights import load_named
 from robotcell.cell import open_cell
 from robotcell.config import load_config
-from robotcell.decision import Observation
+from robotcell.decision import Observation, Primitive
 from robotcell.heightmap import build_heightmap, close_gaps
 from robotcell.perception import find_goal, segment
 
@@ -54,15 +54,15 @@ def inference():
     return Inference(load_named("learned")[0])
 
 
-def observe(heightmap):
+def observe(heightmap, *, may_push=True):
     segmentation = segment(heightmap)
     goal = find_goal(segmentation, segmentation.instances[0].color_name)
-    return Observation(heightmap, segmentation.labels, segmentation.mask(goal), (), may_push=True)
+    return Observation(heightmap, segmentation.labels, segmentation.mask(goal), (), may_push=may_push)
 
 
-def frame_to_action(config, frame, policy):
+def frame_to_action(config, frame, policy, *, may_push=True):
     heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
-    return policy.decide(observe(heightmap))
+    return policy.decide(observe(heightmap, may_push=may_push))
 
 
 def test_encode(benchmark, heightmap):
@@ -75,13 +75,21 @@ def test_maps(benchmark, heightmap, inference, primitive):
     assert np.isfinite(benchmark(inference.maps, planes, goal, primitive)[:, goal]).all()
 
 
-def test_decide(benchmark, heightmap, policy):
-    observation = observe(heightmap)
-    assert np.isfinite(benchmark(policy.decide, observation).q_value)
+# The goal of this frame needs a push; where none is allowed, the decision costs what a clear grasp costs.
+decisions = pytest.mark.parametrize(
+    ("may_push", "primitive"), [(False, Primitive.GRASP), (True, Primitive.PUSH)], ids=["grasp", "push"]
+)
 
 
-def test_frame_to_action(benchmark, config, frame, policy):
-    assert np.isfinite(benchmark(frame_to_action, config, frame, policy).q_value)
+@decisions
+def test_decide(benchmark, heightmap, policy, may_push, primitive):
+    observation = observe(heightmap, may_push=may_push)
+    assert benchmark(policy.decide, observation).primitive is primitive
+
+
+@decisions
+def test_frame_to_action(benchmark, config, frame, policy, may_push, primitive):
+    assert benchmark(frame_to_action, config, frame, policy, may_push=may_push).primitive is primitive
 
 
 def test_beside_the_paper_network(benchmark, config, frame, heightmap, policy):
