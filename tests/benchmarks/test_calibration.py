@@ -13,7 +13,7 @@ from tests.calibration.synthetic import make_views
 def views(request):
     count = request.param
     # Without --benchmark-enable the call runs once; few views are enough to see that it does.
-    if request.config.getoption("benchmark_disable"):
+    if not request.config.getoption("benchmark_enable"):
         count = 15
     return make_views(0, count, corner_px=0.2, position_m=0.0002, rotation_rad=0.0003)[0]
 
