@@ -16,7 +16,7 @@ from calibration.board_pose import (
 )
 from calibration.bundle import BundleNoise, solve_bundle
 from calibration.closed_form import CLOSED_FORMS
-from calibration.consensus import find_consensus
+from calibration.consensus import LEVER, find_consensus
 from calibration.handeye import FLOOR, Fit, Noise, arm_noise, pose_noise, predict, refine, reject_outliers
 from calibration.projection import CornerStack, intrinsics_vector, project, stack_corners
 from calibration.rigid import change, difference
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 _PASSES = 2
 # Held-out errors that differ by less are equal.
 _CLEARLY = 0.01
-# A turn counts as the distance that it moves a point this share of the way between camera and board.
-_LEVER = 0.4
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ def fit_with_free_scale(M: Array, sight: Sight, fit: Fit, on_the_arm: bool) -> F
 
 def lever_m(sight: Sight) -> float:
     """The distance [m] at which a turn counts."""
-    return _LEVER * float(np.median(np.linalg.norm(sight.T_camera_board[:, :3, 3], axis=1)))
+    return LEVER * float(np.median(np.linalg.norm(sight.T_camera_board[:, :3, 3], axis=1)))
 
 
 def moved_arm(M: Array, arm: Array, on_the_arm: bool) -> Array:

@@ -21,7 +21,7 @@ _SUBSETS = 150
 _CONCENTRATIONS = 8
 _SHARE = 0.6
 # A turn counts as the distance that it moves a point this share of the way between camera and board.
-_LEVER = 0.4
+LEVER = 0.4
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,6 @@ def _disagreement(M: Array, C: Array, X: Array, Z: Array, scale: Array) -> Array
     turned = np.einsum("vij,sjk->svik", M[:, :3, :3], Z[:, :3, :3]) - np.einsum(
         "sij,vjk->svik", X[:, :3, :3], C[:, :3, :3]
     )
-    lever = _LEVER * np.median(np.linalg.norm(C[:, :3, 3], axis=1)) * np.abs(scale)[:, None]
+    lever = LEVER * np.median(np.linalg.norm(C[:, :3, 3], axis=1)) * np.abs(scale)[:, None]
     squared = ((carried - seen) ** 2).sum(-1) + lever**2 * 0.5 * (turned**2).sum((-1, -2))
     return np.asarray(np.sqrt(squared))

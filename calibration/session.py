@@ -10,7 +10,6 @@ An interrupted collection keeps every view that was taken.
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -20,6 +19,7 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict
 from calibration.readers import CornerRecord, parse_board, read_json, validate, views_of_corners
 from robotcell.camera_calibration import CameraModel, CharucoBoard, Mount, PointBoard
 from robotcell.errors import ConfigError
+from robotcell.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,7 +79,7 @@ def create_session(folder: Path, header: SessionHeader) -> None:
         raise ConfigError(f"{folder}: there is a session already; go on with --resume, or give another folder")
     try:
         (folder / _VIEWS).mkdir(parents=True, exist_ok=True)
-        _write(folder / _HEADER, header.model_dump_json(indent=1, exclude_none=True))
+        write_whole(folder / _HEADER, header.model_dump_json(indent=1, exclude_none=True) + "\n")
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from error
 
@@ -100,11 +100,12 @@ def add_view(
     """
     views = folder / _VIEWS
     try:
-        Image.fromarray(color).save(views / f"{view.name}.png")
+        # Packed lightly: the arm waits for it.
+        Image.fromarray(color).save(views / f"{view.name}.png", compress_level=1)
         if depth_m is not None:
             units = np.clip(np.rint(depth_m / _DEPTH_UNIT_M), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-            Image.fromarray(units).save(views / f"{view.name}.depth.png")
-        _write(views / f"{view.name}.json", view.model_dump_json(indent=1, exclude_none=True))
+            Image.fromarray(units).save(views / f"{view.name}.depth.png", compress_level=1)
+        write_whole(views / f"{view.name}.json", view.model_dump_json(indent=1, exclude_none=True) + "\n")
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from error
 
@@ -157,12 +158,3 @@ def read_session(folder: Path, mount: Mount | None = None) -> Views:
     records = load_records(folder)
     date = max((record.taken for record in records), default=header.started)
     return views_of_corners(records, header.mount, header.camera, header.board, date, folder)
-
-
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(f"{path.name}.part")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)

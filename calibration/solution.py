@@ -12,6 +12,7 @@ from robotcell.camera_calibration import (
     CameraCalibration,
     CameraModel,
     DepthCorrection,
+    FixedTag,
     HeldOutErrors,
     Spread,
     load_calibration,
@@ -187,17 +188,22 @@ class Solution:
         )
 
 
-def save_if_better(solution: Solution, path: Path) -> None:
+def save_if_better(solution: Solution, path: Path, tags: tuple[FixedTag, ...] = ()) -> None:
     """Write the calibration file, unless a better and equally fresh one of the same camera stands there.
 
     Better is a smaller uncertainty (the volume of the covariance): it falls with more and with quieter views. A file
     of another camera, mount or resolution, or one that is older than half a year, is never better.
 
+    Args:
+        solution: to write.
+        path: of the file.
+        tags: fixed tags that were in view.
+
     Raises:
         CalibrationError: the result was refused, or what stands there is better.
         ConfigError: what stands there is no calibration, or the file cannot be written.
     """
-    calibration = solution.calibration()
+    calibration = solution.calibration().model_copy(update={"tags": tags})
     if path.exists():
         before = load_calibration(path)
         if _comparable(before, calibration) and _log_volume(before) < _log_volume(calibration) - _CLEARLY:

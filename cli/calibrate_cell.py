@@ -7,11 +7,10 @@ from typing import Annotated
 
 import typer
 
+from cli.options import CellFile  # noqa: TC001 - typer reads it
+
 # Everything heavy is imported inside the commands, so that --help answers at once.
 
-CellFile = Annotated[
-    Path | None, typer.Option("--cell", help="The cell's TOML file; without one, the twin with its defaults.")
-]
 SquaresX = Annotated[int, typer.Option(min=3, help="Squares of the board along its rows.")]
 SquaresY = Annotated[int, typer.Option(min=3, help="Squares along its columns.")]
 SquareMm = Annotated[float, typer.Option(min=5, max=200, help="Side of a square, as measured on the print.")]

@@ -21,7 +21,7 @@ from calibration.target import DEFAULT_BOARD, bolted_to_flange, held_by_gripper,
 from cli.calibrate_solve import print_solution
 from cli.console import progress, report_error, results
 from robotcell.album import save_picture
-from robotcell.camera_calibration import CharucoBoard, FixedTag, load_calibration, save_calibration
+from robotcell.camera_calibration import CharucoBoard, FixedTag
 from robotcell.cell import Cell, open_cell
 from robotcell.config import CellConfig, load_config
 from robotcell.drift import check_tags, find_tags
@@ -185,8 +185,7 @@ def _conclude(folder: Path, out: Path, tags: tuple[FixedTag, ...], cell_file: Pa
     if not solution.accepted:
         return _REFUSED
     for path in (folder / "calibration.json", out):
-        save_if_better(solution, path)
-        save_calibration(load_calibration(path).model_copy(update={"tags": tags}), path)
+        save_if_better(solution, path, tags)
     if tags:
         err.print(Text(f"fixed tags in view: {', '.join(str(tag.id) for tag in tags)}"))
     beside = cell_file is not None and out.resolve().parent == cell_file.resolve().parent

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from cli.calibrate import app as calibrate_app
+from cli.options import CellFile, Meshes, Objects, Scene, Seed  # noqa: TC001 - typer reads them
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -34,10 +35,6 @@ twin_app = typer.Typer(
 app.add_typer(twin_app, name="twin")
 app.add_typer(calibrate_app, name="calibrate")
 
-CellFile = Annotated[
-    Path | None, typer.Option("--cell", help="The cell's TOML file; without one, the twin with its defaults.")
-]
-
 
 @app.command()
 def pick(
@@ -46,20 +43,10 @@ def pick(
     ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Pick everything on the table.")] = False,
     cell: CellFile = None,
-    scene: Annotated[
-        str | None,
-        typer.Option(help="Twin: random, novel, challenging-01 to -10, or a scene file.", show_default=False),
-    ] = None,
-    meshes: Annotated[
-        Path | None,
-        typer.Option(help="Twin: folder of the OBJ files that a scene file names.", show_default=False),
-    ] = None,
-    objects: Annotated[
-        int | None, typer.Option(help="Twin: how many objects a random scene has.", show_default=False)
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="Twin: the same seed gives the same job.", show_default=False)
-    ] = None,
+    scene: Scene = None,
+    meshes: Meshes = None,
+    objects: Objects = None,
+    seed: Seed = None,
     policy: Annotated[
         str | None, typer.Option(help="Who decides: learned, heuristic, grasp-only, random.", show_default=False)
     ] = None,
@@ -240,16 +227,10 @@ def serve(
         typer.Option(min=0, max=65535, help="Of the control socket for faults; none unless given.", show_default=False),
     ] = None,
     cell: CellFile = None,
-    scene: Annotated[
-        str | None, typer.Option(help="random, novel, challenging-01 to -10, or a scene file.", show_default=False)
-    ] = None,
-    meshes: Annotated[
-        Path | None, typer.Option(help="Folder of the OBJ files that a scene file names.", show_default=False)
-    ] = None,
-    objects: Annotated[
-        int | None, typer.Option(help="How many objects a random scene has.", show_default=False)
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="The same seed gives the same scene.", show_default=False)] = None,
+    scene: Scene = None,
+    meshes: Meshes = None,
+    objects: Objects = None,
+    seed: Seed = None,
     expose: Annotated[
         bool, typer.Option("--expose", help="Listen on an address that other machines can reach.")
     ] = False,
@@ -290,16 +271,10 @@ def record(
     out: Annotated[Path, typer.Option(help="The .db3 file to write.")],
     seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long.")] = 3.0,
     cell: CellFile = None,
-    scene: Annotated[
-        str | None, typer.Option(help="random, novel, challenging-01 to -10, or a scene file.", show_default=False)
-    ] = None,
-    meshes: Annotated[
-        Path | None, typer.Option(help="Folder of the OBJ files that a scene file names.", show_default=False)
-    ] = None,
-    objects: Annotated[
-        int | None, typer.Option(help="How many objects a random scene has.", show_default=False)
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="The same seed gives the same scene.", show_default=False)] = None,
+    scene: Scene = None,
+    meshes: Meshes = None,
+    objects: Objects = None,
+    seed: Seed = None,
 ) -> None:
     """Record what the camera sees of a scene, for librealsense to play, or as camera.source of a cell.
 

@@ -7,7 +7,6 @@ Metres, radians; errors in millimetres, degrees and pixels, as their names say.
 from __future__ import annotations
 
 import json
-import os
 from datetime import datetime, timedelta, timezone
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
@@ -16,6 +15,7 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from robotcell.errors import CalibrationError, ConfigError
 from robotcell.geometry import Array, check_transform
+from robotcell.whole_file import write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -314,13 +314,8 @@ def save_calibration(calibration: CameraCalibration, path: Path) -> None:
         ConfigError: it cannot be written.
     """
     text = calibration.model_dump_json(indent=1, exclude_none=True) + "\n"
-    partial = path.with_name(f"{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
+        write_whole(path, text)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error

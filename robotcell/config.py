@@ -169,6 +169,12 @@ class CameraMount(_Table):
         return self
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image [px]."""
+        width, height = self.resolution.split("x")
+        return int(width), int(height)
+
+    @property
     def measured(self) -> CameraCalibration | None:
         """What the calibration file holds; None without one. Whether it fits the camera, its `check` says."""
         return self._measured

@@ -277,14 +277,13 @@ def _examine_calibration(mount: CameraMount) -> Iterator[Finding]:
     measured = mount.measured
     if measured is None:
         raise ConfigError(f"{mount.calibration}: not loaded")
-    width, height = (int(number) for number in mount.resolution.split("x"))
     yield Finding(
         "calibration",
         "file",
         f"{mount.calibration}, {measured.date:%Y-%m-%d}, {measured.views} views, held out "
         f"{measured.held_out.mm.median:.1f} mm, camera {measured.camera.serial or 'not named'}",
     )
-    measured.check(resolution=(width, height))
+    measured.check(resolution=mount.size)
     yield Finding("calibration", "fits", f"{mount.resolution}, not too old")
 
 

@@ -35,12 +35,12 @@ PROTECTIVE_FORCE_N = 150.0
 TRACKING_ERROR_RAD = 0.05
 WATCHDOG_S = 0.1
 # A motion that starts pressed against something may press this much more. Assumed.
-_LEAVING_FORCE_N = 30.0
+LEAVING_FORCE_N = 30.0
 
 # Share of the position error that each joint controller corrects within a step.
 JOINT_GAINS = (0.5,) * 6
 # A rotation counts as the way that the flange goes when it turns about the tcp: no end of the tool outruns the speed.
-_ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
+ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
 
 _T_TCP_FLANGE = invert_transform(linkage.T_FLANGE_TCP)
 
@@ -138,7 +138,7 @@ class TwinArm(Arm):
         q = self._path[-1]
         T_start = kinematics.forward(q) @ linkage.T_FLANGE_TCP
         turn = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
-        distance = max(float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3])), turn * _ROTATION_LEVER_M)
+        distance = max(float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3])), turn * ROTATION_LEVER_M)
         s = trapezoid(distance, speed_m_s, acceleration_m_s2, STEP_S)
         if not len(s):
             return
@@ -177,7 +177,7 @@ class TwinArm(Arm):
         self._braking = False
         # More than at the start, so that the arm can leave a contact that stopped it.
         at_start = _norm(self._world.contact().robot_force)
-        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + _LEAVING_FORCE_N)
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + LEAVING_FORCE_N)
         if self._kicked_at is not None:
             self._kicked_at = self._world.time_s
 

@@ -9,7 +9,7 @@ from robotcell.errors import ConnectionLost
 from robotcell.interfaces import Camera, RgbdFrame
 from sim_twin.noise import WARM_UP_FRAMES, NoiseOptions
 from sim_twin.raycast import Indices, load_open3d
-from sim_twin.renderer import FRAMES_PER_S, MODES, Floats, Renderer
+from sim_twin.renderer import FRAMES_PER_S, Floats, Renderer
 from sim_twin.wire.frames import SERIAL
 from sim_twin.world import STEP_S
 
@@ -62,9 +62,8 @@ class TwinCamera(Camera):
         if self._first_frame is not None:
             return
         if self._mount.measured is not None:
-            optics = MODES[self._mount.resolution]
             # Nobody leans on a simulated camera: its calibration does not age.
-            self._mount.measured.check(serial=SERIAL, resolution=(optics.width, optics.height), max_age=timedelta.max)
+            self._mount.measured.check(serial=SERIAL, resolution=self._mount.size, max_age=timedelta.max)
         load_open3d()
         self._world.attach(self)
         try:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import fcntl
 import json
 import math
-import os
 import shutil
 import time
 import zipfile
@@ -35,6 +34,7 @@ from policy.training.replay import Replay
 from policy.training.shard import Shard
 from policy.weights import save_weights
 from robotcell.errors import ConfigError
+from robotcell.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -402,13 +402,7 @@ def _write_weights(
 
 
 def _write_metrics(run: Path, history: list[Metrics]) -> None:
-    path = run / "metrics.jsonl"
-    partial = path.with_suffix(".partial")
-    with partial.open("w", encoding="utf-8") as file:
-        file.writelines(_json(line) + "\n" for line in history)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    write_whole(run / "metrics.jsonl", "".join(_json(line) + "\n" for line in history))
 
 
 def _json(metrics: Metrics) -> str:

@@ -178,7 +178,7 @@ class D415(Camera):
 
     def _connect(self) -> None:
         rs = load_pyrealsense2()
-        width, height = self._resolution
+        width, height = self._mount.size
         config = rs.config()
         config.enable_stream(rs.stream.depth, 0, width, height, rs.format.z16, FRAMES_PER_S)
         config.enable_stream(rs.stream.color, 0, width, height, rs.format.rgb8, FRAMES_PER_S)
@@ -195,11 +195,6 @@ class D415(Camera):
         if self._mount.measured is not None:
             self._mount.measured.check(serial=self._serial, resolution=(width, height))
         self._start(rs, context, config, device)
-
-    @property
-    def _resolution(self) -> tuple[int, int]:
-        width, height = self._mount.resolution.split("x")
-        return int(width), int(height)
 
     def _open_source(self, rs: Any) -> Any:
         """The context in which the camera is to be found."""

@@ -28,7 +28,7 @@ from robotcell.drivers.ur5e_link import (
     StartJoints,
     StartLinear,
 )
-from robotcell.drivers.ur_controller import IN_USE_CURE, PLAYING, STOPPED
+from robotcell.drivers.ur_controller import IN_USE_CURE, PLAYING, PROTECTIVE_STOP, STOPPED
 from robotcell.shared_record import SharedRecord
 
 if TYPE_CHECKING:
@@ -72,7 +72,6 @@ _SETTLES_S = 0.2
 # The offset between two clocks is the smallest that was seen in this and the previous period of so many seconds: it
 # drifts by less than a millisecond in that time.
 _OFFSET_PERIOD_S = 10.0
-_PROTECTIVE_STOP = 3
 # Uploading is left to us: with the library's default its own thread uploads the program again after a lost connection.
 _FLAG_NO_WAIT = 16
 
@@ -196,7 +195,7 @@ class _Session:
         if stamp != self._stamp:
             self._stamp = stamp
             fields["t"] = self._offset.to_local(stamp)
-        if fields["safety_mode"] != _PROTECTIVE_STOP:
+        if fields["safety_mode"] != PROTECTIVE_STOP:
             self._stopped_at = 0.0
         elif not self._stopped_at:
             self._stopped_at = time.monotonic()

@@ -34,7 +34,7 @@ _ROBOT_MODES = {
     _RUNNING: "running",
     8: "updating its firmware",
 }
-_PROTECTIVE_STOP = 3
+PROTECTIVE_STOP = 3
 _NORMAL_SAFETY = (1, 2)
 _POWER_ON = "power it on and release the brakes at the pendant (on the bottom left: red dot > ON > START)"
 _EMERGENCY_SAFETY = (6, 7)
@@ -82,7 +82,7 @@ class Controller:
     @property
     def protective_stop(self) -> bool:
         """Whether it is in a protective stop."""
-        return self.safety_mode == _PROTECTIVE_STOP
+        return self.safety_mode == PROTECTIVE_STOP
 
 
 def inspect(host: str) -> Controller:
@@ -169,7 +169,7 @@ def slow_slider(speed_fraction: float) -> str:
 
 def arm_mode(robot_mode: int, safety_mode: int, *, ready: bool) -> ArmMode:
     """The mode of an arm; `ready` says whether our program runs on its controller."""
-    if safety_mode == _PROTECTIVE_STOP:
+    if safety_mode == PROTECTIVE_STOP:
         return ArmMode.PROTECTIVE_STOP
     if safety_mode in _EMERGENCY_SAFETY:
         return ArmMode.EMERGENCY_STOP
@@ -180,7 +180,7 @@ def arm_mode(robot_mode: int, safety_mode: int, *, ready: bool) -> ArmMode:
 
 def why_not_ready(robot_mode: int, safety_mode: int) -> str:
     """What happened to an arm whose mode is not READY, and what to do."""
-    if safety_mode == _PROTECTIVE_STOP:
+    if safety_mode == PROTECTIVE_STOP:
         return "the arm is in a protective stop: look at the cell, clear the contact, then recover"
     if safety_mode in _SAFETY_CURES:
         return f"the arm is {_SAFETY_CURES[safety_mode]}; then recover"

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_twin.arm import PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
+from sim_twin.arm import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
 from sim_twin.wire.ur_motion import PERIOD_S, Arm, ScriptError
 from sim_twin.wire.ur_variables import BIT_REGISTERS, REGISTERS
 
@@ -35,8 +35,6 @@ _POWER_ON_S = 0.5
 _BRAKE_RELEASE_S = 0.5
 # How fast slider and pause change the speed, per second: an arm at full joint speed then brakes at 19 rad/s^2.
 _RATE_SLOPE = 6.0
-# A motion that starts pressed against something may press this much more, as in sim_twin.arm.
-_LEAVING_FORCE_N = 30.0
 # What the arm does is compared with the targets of this many periods before it was measured: it follows with a delay.
 _TRACKING_PERIODS = 20
 _HISTORY_PERIODS = 500
@@ -354,7 +352,7 @@ class Controller:
         # Somebody may have moved the arm meanwhile.
         self.arm.hold()
         self._targets[:] = self.arm.q
-        self._force_limit_n = max(PROTECTIVE_FORCE_N, self._force_n + _LEAVING_FORCE_N)
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, self._force_n + LEAVING_FORCE_N)
         return True
 
     def safeguard_stop(self) -> None:
@@ -441,4 +439,4 @@ class Controller:
     def _allow_leaving(self, cell: np.void) -> None:
         """Let an arm that starts to move press a little more than at the start, so that it can leave a contact."""
         at_start = float(np.linalg.norm(cell["robot_force"]))
-        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + _LEAVING_FORCE_N)
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + LEAVING_FORCE_N)

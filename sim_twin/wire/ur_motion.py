@@ -14,17 +14,14 @@ from typing import TypeAlias
 import numpy as np
 from ur_analytic_ik import ur5e
 
-from robotcell import kinematics, linkage
+from robotcell import kinematics
 from robotcell.geometry import Array, invert_transform, rotvec_to_matrix
+from sim_twin.arm import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
 from sim_twin.trajectory import Trapezoid
 from sim_twin.wire.ur_pose import ZERO_POSE, Pose, matrix_to_pose, pose_to_matrix, rotation_vector
 
 PERIOD_S = 0.002
-# As in sim_twin.arm: the leading joint brakes at this rate wherever the controller itself ends a motion.
-STOP_DECELERATION_RAD_S2 = 20.0
 
-# A rotation of the tool counts as the way of a point this far from the tcp, as in sim_twin.arm.
-_ROTATION_LEVER_M = linkage.CLOSED_LENGTH_M
 # Two targets of neighbouring periods may differ by this much: half more than at the fastest joint speed.
 _MAX_STEP_RAD = 1.5 * kinematics.MAX_JOINT_SPEED * PERIOD_S
 _ARRIVED_RAD = 1e-9
@@ -335,7 +332,7 @@ def stop_line(arm: Arm, deceleration: float) -> Motion:
     if not deceleration > 0:
         raise ScriptError("stopl: the deceleration must be positive")
     twist = arm.twist(arm.q, arm.momentum)
-    speed = max(float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:])) * _ROTATION_LEVER_M)
+    speed = max(float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:])) * ROTATION_LEVER_M)
     if speed == 0:
         yield from stop_joints(arm, STOP_DECELERATION_RAD_S2)
         return
@@ -422,7 +419,7 @@ def servo_circular(arm: Arm, pose: Sequence[float], speed: float, acceleration: 
     while True:
         T = arm.forward(arm.q)
         way = np.concatenate([T_goal[:3, 3] - T[:3, 3], rotation_vector(T_goal[:3, :3] @ T[:3, :3].T)])
-        distance = max(float(np.linalg.norm(way[:3])), float(np.linalg.norm(way[3:])) * _ROTATION_LEVER_M)
+        distance = max(float(np.linalg.norm(way[:3])), float(np.linalg.norm(way[3:])) * ROTATION_LEVER_M)
         approach = min(speed, math.sqrt(2 * acceleration * distance))
         if distance <= approach * PERIOD_S:
             arm.command(arm.inverse(T_goal, arm.q))
@@ -480,7 +477,7 @@ class _LineLeg:
         self.turn = np.array(rotation_vector(T_goal[:3, :3] @ self._T_start[:3, :3].T))
         self._blend_m = move.blend_m
         length, turn = float(np.linalg.norm(self.way)), float(np.linalg.norm(self.turn))
-        distance = max(length, turn * _ROTATION_LEVER_M)
+        distance = max(length, turn * ROTATION_LEVER_M)
         if distance < 1e-9:
             distance = 0.0
         self._profile = Trapezoid(distance, move.speed, move.acceleration) if distance > 0 else None

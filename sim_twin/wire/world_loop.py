@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING
@@ -58,8 +57,9 @@ def serve_world(
         ready: gets {"poses": name of the record of all poses, "visuals": tuple of `Visual`}, or {"error": text}.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    ended = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: ended.set())
+    # Signals that came. A plain list: one that comes while the handler of another runs must find no lock.
+    ended: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: ended.append(number))
     world = World(config, TwinOptions.model_validate(config.backend.options))
     commands = Record(ARM_COMMAND, arm_command)
     fingers = Record(GRIPPER_COMMAND, gripper_command)
@@ -158,10 +158,10 @@ class _Loop:
         self._steps = 0
         self._skipped = 0
 
-    def run(self, ended: threading.Event, faults: Connection) -> None:
+    def run(self, ended: list[int], faults: Connection) -> None:
         """Until it is told to end, or nobody is there to tell it."""
         due = time.monotonic()
-        while not ended.is_set():
+        while not ended:
             due += STEP_S
             wait = due - time.monotonic()
             if wait > 0:
