@@ -14,7 +14,7 @@ from policy.grasping import Jaw, finger_reach, finger_room, lay_table
 from policy.network import GRASP, PUSH
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
-from policy.selection import best_cells, check_maps, push_mask, pushes, surface_at
+from policy.selection import best_cells, check_maps, faded, push_mask, pushes, surface_at
 from policy.surface import cell_centers, estimate_surface
 from robotcell.decision import Action, Primitive
 from robotcell.errors import NoTarget
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 _GRASP_THRESHOLD = 0.75
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
-# A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
-# network, and at an edge the fingers slip. Standard deviation in cells.
-_SMOOTH_CELLS = 1.5
 # So many of the best grasps are looked at for whether the fingers come down beside what stands around; where they do
 # not, this share of the value is left.
 _LOOKED_AT = 400
@@ -98,7 +95,7 @@ class LearnedPolicy:
         q = self._inference.maps(planes, targets, GRASP)
         check_maps(q, targets, "grasp")
         mask = _allowed(Primitive.GRASP, observation, targets, len(q))
-        best = list(best_cells(_smooth(q, targets), mask, _LOOKED_AT))
+        best = list(best_cells(faded(q, targets), mask, _LOOKED_AT))
         if not best:
             return None
         rotation, rows, cols, values = (np.array(column) for column in zip(*best, strict=True))
@@ -135,12 +132,6 @@ class LearnedPolicy:
     @staticmethod
     def _position(observation: Observation, row: int, col: int) -> tuple[float, float]:
         return observation.heightmap.workspace.position(row, col)
-
-
-def _smooth(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-    """Q maps (K, H, W) averaged over neighbours, with nothing outside of a mask (H, W)."""
-    inside = np.where(mask, q, np.float32(0))
-    return np.stack([cv2.GaussianBlur(plane, (0, 0), _SMOOTH_CELLS) for plane in inside])
 
 
 def _allowed(

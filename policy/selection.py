@@ -25,6 +25,9 @@ _DILATIONS = 15
 _PUSH_TRIES = 2000
 # What is pushed stays this far inside the workspace.
 _RIM_M = 0.02
+# A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
+# network, and at an edge the fingers slip. Standard deviation in cells.
+_SMOOTH_CELLS = 1.5
 # Maps whose values differ by less than this say nothing.
 _FLAT = 1e-6
 
@@ -51,6 +54,12 @@ def push_mask(targets: npt.NDArray[np.bool_], objects: npt.NDArray[np.bool_]) ->
     """(H, W) cells whose pushes concern the targets: on an object, within 15 cells of them."""
     grown = cv2.dilate(targets.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=_DILATIONS) > 0
     return np.asarray(grown & objects)
+
+
+def faded(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
+    """Q maps (K, H, W) of grasps averaged over neighbours, with nothing outside of a mask (H, W)."""
+    inside = np.where(mask, q, np.float32(0))
+    return np.stack([cv2.GaussianBlur(plane, (0, 0), _SMOOTH_CELLS) for plane in inside])
 
 
 def best_cells(

@@ -1,7 +1,8 @@
 """A rollout worker: plays scenes, tries several actions in every state, and keeps what came of them.
 
 In each state the saved world is put back after every attempt, so one rendered picture yields a dozen labels: what the
-network would do (for any object, and for one object as goal), near misses of it, and what it would not do.
+network would do (for any object, and for one object as goal), near misses of it, and what it would not do. After a
+push the network's grasp of what was pushed is tried as well: whether that came free is what the push is worth.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from policy.encoding import encode
 from policy.grasping import Jaw, find_grasps, lay_table
 from policy.push_line import push_line
-from policy.selection import best_cells, push_mask
+from policy.selection import best_cells, faded, push_mask
 from policy.surface import estimate_surface
 from policy.training.environment import GRASP, PUSH, Outcome, PushGraspEnv, State, Trial
 from policy.training.shard import Shard, pack_height
@@ -38,10 +39,11 @@ _PUSH_TRIES = 25
 _GEOMETRIC_SHARE = 0.5
 # A state whose best grasp succeeds is left by it, or by a push with this probability (stage I, stage II).
 _LEAVE_BY_PUSH = (0.15, 0.35)
-# Stage I: about ten objects, dropped, as the paper has it; or a group. Stage II: up to thirty, or a group.
+# Stage I: about ten objects, dropped, as the paper has it; stage II: up to thirty. Or a group, or an object that others
+# stand around.
 _KINDS = {
-    1: (("drop", 6, 14, 0.7), ("packed", 4, 10, 0.3)),
-    2: (("drop", 14, 30, 0.5), ("packed", 4, 12, 0.5)),
+    1: (("drop", 6, 14, 0.6), ("packed", 4, 10, 0.2), ("enclosed", 3, 8, 0.2)),
+    2: (("drop", 14, 30, 0.35), ("packed", 4, 12, 0.25), ("enclosed", 3, 8, 0.4)),
 }
 
 
@@ -93,7 +95,8 @@ class _Book:
         self.scenes.append(scene)
         return len(self.states) - 1
 
-    def add_trial(self, state: int, choice: _Choice, trial: Trial) -> None:
+    def add_trial(self, state: int, choice: _Choice, trial: Trial) -> int:
+        """Returns the state that the trial led to, -1 where nothing follows."""
         after = -1
         if trial.after is not None and any(goes_on for *_, goes_on in trial.rows):
             after = self.add_state(trial.after, self.scenes[state])
@@ -104,6 +107,7 @@ class _Book:
                     *(after if goes_on else -1, choice.greedy, int(trial.outcome)),
                 )
             )
+        return after
 
     def shard(self) -> Shard:
         column = list(zip(*self.rows, strict=True)) or [()] * 11
@@ -171,13 +175,12 @@ def _play(
         known = None
         maps = None
         if network is not None:
-            planes = encode(state.height_m, state.heightmap.color)
-            maps = _Maps(*(network.maps(planes, state.labels > 0, primitive) for primitive in (GRASP, PUSH)))
+            objects = state.labels > 0
+            maps = _Maps(*(_q(network, state, objects, primitive) for primitive in (GRASP, PUSH)))
         picks: list[_Choice] = []
         useful: list[_Choice] = []
         for choice in _choices(state, maps, collection, config, rng):
-            trial = env.attempt(choice.primitive, choice.rotation, choice.cell)
-            book.add_trial(here, choice, trial)
+            trial = _try(env, choice, here, network, rng, book)
             if trial.held:
                 picks.append(choice)
             elif trial.outcome is Outcome.PUSHED:
@@ -193,6 +196,29 @@ def _play(
             known = len(book.states) - 1
 
 
+def _try(
+    env: PushGraspEnv, choice: _Choice, here: int, network: Inference | None, rng: np.random.Generator, book: _Book
+) -> Trial:
+    """Note what a choice would come to; after a push, also what the best grasp of its object would."""
+    if choice.primitive == GRASP:
+        trial = env.attempt(choice.primitive, choice.rotation, choice.cell)
+        book.add_trial(here, choice, trial)
+        return trial
+    target = env.state.labels[choice.cell]
+    with env.aside():
+        trial = env.advance(choice.primitive, choice.rotation, choice.cell)
+        after = book.add_trial(here, choice, trial)
+        mask = env.state.labels == target
+        if network is not None and after >= 0 and mask.any():
+            grasp = _best_grasp(_q(network, env.state, mask, GRASP), mask, 1, rng)
+            book.add_trial(after, grasp, env.attempt(grasp.primitive, grasp.rotation, grasp.cell))
+    return trial
+
+
+def _q(network: Inference, state: State, cells: npt.NDArray[np.bool_], primitive: int) -> npt.NDArray[np.float32]:
+    return network.maps(encode(state.height_m, state.heightmap.color), cells, primitive)
+
+
 def _choices(
     state: State, maps: _Maps | None, collection: Collection, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[_Choice]:
@@ -206,7 +232,7 @@ def _choices(
         if maps is not None and not explore:
             # The first for any object, as in pick-all; the others with one object as the goal.
             mask = objects if i == 0 else state.labels == present[int(rng.integers(len(present)))]
-            yield _best_grasp(maps.grasp, mask, rng)
+            yield _best_grasp(maps.grasp, mask, 1 if rng.random() < _GREEDY_SHARE else _AMONG_BEST, rng)
         elif geometric and rng.random() < _GEOMETRIC_SHARE:
             yield geometric[int(rng.integers(len(geometric)))]
         else:
@@ -223,11 +249,13 @@ def _choices(
             yield from _random_push(state, mask, config, rng)
 
 
-def _best_grasp(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> _Choice:
-    greedy = rng.random() < _GREEDY_SHARE
-    best = list(best_cells(q, mask, 1 if greedy else _AMONG_BEST))
+def _best_grasp(
+    q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], among: int, rng: np.random.Generator
+) -> _Choice:
+    """One of so many of the best."""
+    best = list(best_cells(faded(q, mask), mask, among))
     k, row, col, _ = best[int(rng.integers(len(best)))]
-    return _Choice(GRASP, k, (row, col), greedy)
+    return _Choice(GRASP, k, (row, col), greedy=among == 1)
 
 
 def _best_push(

@@ -37,8 +37,8 @@ class CollectSettings(_Table):
     """How a scene is played."""
 
     # Attempts of each primitive in every state, each from the same saved state.
-    grasps: Annotated[int, Field(ge=0)] = 12
-    pushes: Annotated[int, Field(ge=0)] = 4
+    grasps: Annotated[int, Field(ge=0)] = 6
+    pushes: Annotated[int, Field(ge=0)] = 6
     # States of a scene at most.
     states: Count = 6
 
@@ -72,7 +72,7 @@ class LearningSettings(_Table):
 
     # Attempts of each primitive in an update.
     grasps: Count = 32
-    pushes: Count = 24
+    pushes: Count = 32
     # Adam; follows half a cosine from the first to the last update of a stage.
     learning_rate: Positive = 1e-3
     final_learning_rate: Positive = 1e-4
@@ -111,12 +111,12 @@ class TrainConfig(_Table):
         exploration_end=0.1,
     )
     stage2: StageSettings = StageSettings(
-        rounds=4,
-        scenes_per_round=24,
+        rounds=5,
+        scenes_per_round=32,
         updates_per_round=400,
         warmup_rounds=0,
-        exploration_start=0.2,
-        exploration_end=0.05,
+        exploration_start=0.4,
+        exploration_end=0.1,
     )
 
     def stage(self, number: int) -> StageSettings:

@@ -7,6 +7,7 @@ random of the cell (camera, colours, friction, masses, sizes) is drawn anew for 
 from __future__ import annotations
 
 import enum
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,8 @@ from sim_twin.rig import Ending, RigWorld
 from sim_twin.world import Friction
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from robotcell.geometry import Array
 
 # Paper, stage II: the border is 10 dilations wide; a cell of it from 2 cm to 30 cm high is occupied; a push that gains
@@ -117,8 +120,8 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
     """Push and grasp until the table is clear (stage I) or the goal is picked (stage II).
 
     Observations are encoded heightmaps (`policy.encoding`), actions (primitive, rotation, row, col); a grasp has eight
-    rotations, so `rotation` counts modulo 8. `info` holds the labels and the goal's. `attempt`, `save` and `restore`
-    give what a learner may ask of a simulator beyond that: other actions in the same state.
+    rotations, so `rotation` counts modulo 8. `info` holds the labels and the goal's. `attempt` and
+    `aside` give what a learner may ask of a simulator beyond that: other actions in the same state.
 
     Args:
         config: of the cell.
@@ -155,7 +158,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
-        """A new scene; `options` may give `kind` ("drop", "packed") and `count` (objects).
+        """A new scene; `options` may give `kind` ("drop", "packed", "enclosed") and `count` (objects).
 
         Raises:
             ConfigError: no scene came to rest in the workspace.
@@ -189,18 +192,28 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         over = picked if self._stage == 2 else not self.state.labels.any()
         return self._observation(), max(rewards, default=0.0), over, False, self._info() | {"outcome": trial.outcome}
 
-    def attempt(self, primitive: int, rotation: int, cell: Cell) -> Trial:
-        """What an action would come to; the state stays as it is."""
-        world = self._need()
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Whatever is done inside is undone at the end: the scene stands as it stood."""
+        world, state = self._need(), self._state
         saved = world.save()
-        trial = self._run(primitive, rotation, cell)
-        world.restore(saved)
-        return trial
+        try:
+            yield
+        finally:
+            world.restore(saved)
+            self._state = state
+
+    def attempt(self, primitive: int, rotation: int, cell: Cell) -> Trial:
+        """What an action would come to; the scene stays as it is."""
+        with self.aside():
+            return self._run(primitive, rotation, cell)
 
     def advance(self, primitive: int, rotation: int, cell: Cell) -> Trial:
         """Run an action for good: what was held is taken off the table."""
         world = self._need()
         trial = self._run(primitive, rotation, cell)
+        if trial.outcome is Outcome.NO_START:
+            return trial
         world.take(tuple(label - 1 for label in trial.held))
         world.withdraw()
         world.take(world.drop_outs())
@@ -341,7 +354,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         return encode(self.state.height_m, self.state.heightmap.color)
 
     def _info(self) -> dict[str, Any]:
-        return {"labels": self.state.labels, "goal": self._goal}
+        return {"labels": self.state.labels.copy(), "goal": self._goal}
 
     def _need(self) -> RigWorld:
         if self._world is None:

@@ -17,6 +17,7 @@ from policy.encoding import encode
 from policy.network import GRASP, GRASP_ROTATIONS, PUSH
 from policy.precision import autocast
 from policy.rotation import MARGINS, Copies
+from policy.selection import best_cells, faded
 from policy.training.augment import crop
 from policy.training.shard import unpack_height
 
@@ -135,9 +136,10 @@ class Learner:
     ) -> None:
         """Find what can be reached after the pushes that were not valued yet, and after those valued longest ago.
 
-        The value is that of Double DQN, Q_target(s', argmax_a Q_online(s', a)) over the actions at the cells of the
-        object that the attempt was about. The target network then becomes a copy of the online one, so the two that
-        are asked are a round apart.
+        The value is that of Double DQN, Q_target(s', argmax_a Q_online(s', a)) over the grasps at the object that the
+        attempt was about. Pushes do not count: with the paper's rewards, pushing for ever is worth 0.5 / (1 - gamma) =
+        1, as much as a grasp, and a maximum over both would not tell whether the object came free. The target network
+        then becomes a copy of the online one, so the two that are asked are a round apart.
 
         Args:
             replay: of the attempts.
@@ -149,37 +151,32 @@ class Learner:
         oldest = open_[np.argsort(replay.valued[open_], kind="stable")]
         never = int((replay.valued[open_] < 0).sum())
         chosen = oldest[: max(never, self._settings.values_per_round)]
-        rng = np.random.default_rng([self._seed, self._stage, round_, 1])
         self.online.eval()
         found: dict[tuple[int, int, int], float] = {}
         for done, number in enumerate(chosen.tolist()):
             key = (int(attempts.shard[number]), int(attempts.next_state[number]), int(attempts.target[number]))
             if key not in found:
-                found[key] = self.value(replay.view(*key[:2]), key[2], rng)
+                found[key] = self.value(replay.view(*key[:2]), key[2])
             replay.value[number], replay.valued[number] = found[key], round_
             on_progress(done + 1, len(chosen))
         self.target.load_state_dict(self.online.state_dict())
 
     @torch.no_grad()
-    def value(self, view: View, goal: int, rng: np.random.Generator) -> float:
-        """Q_target of the action at an object that Q_online likes best; 0 if it is not seen.
-
-        Of the directions of a push only one half, drawn at random, is looked at: they come with the eight rotations
-        that a grasp needs.
-        """
+    def value(self, view: View, goal: int) -> float:
+        """Q_target of the grasp at an object that Q_online likes best; 0 if it is not seen."""
         cells = view.labels == goal
         if not cells.any():
             return 0.0
-        first = int(rng.integers(2)) * GRASP_ROTATIONS
-        copies = Copies.around(cells, range(first, first + GRASP_ROTATIONS), MARGINS[GRASP])
+        copies = Copies.around(cells, range(GRASP_ROTATIONS), MARGINS[GRASP])
         turned = copies.turn(encode(unpack_height(view.height), view.color))
         x = torch.from_numpy(turned).to(self.device, memory_format=torch.channels_last)
         with autocast(self.device):
-            online, target = (network(x).float().cpu().numpy() for network in (self.online, self.target))
-        values = [
-            np.stack([copies.values(maps[:, primitive]) for primitive in (GRASP, PUSH)]) for maps in (online, target)
-        ]
-        return double_q(*values)
+            q = self.online(x)[:, GRASP].float().cpu().numpy()
+        maps = np.zeros((GRASP_ROTATIONS, *cells.shape), np.float32)
+        maps[:, copies.rows, copies.cols] = copies.values(q)
+        rotation, row, col, _ = next(best_cells(faded(maps, cells), cells, 1))
+        chosen = crop(view, GRASP, (row, col), rotation, None)[None]
+        return float(self._at_middle(self.target, chosen, np.array([GRASP]))[0])
 
     @torch.no_grad()
     def validate(self, replay: Replay, newest: int) -> dict[str, float]:
@@ -224,11 +221,6 @@ class Learner:
         middle = crops.shape[-1] // 2
         chosen: Tensor = q.float()[torch.arange(len(x)), torch.from_numpy(primitive), middle, middle]
         return chosen
-
-
-def double_q(online: npt.NDArray[np.float32], target: npt.NDArray[np.float32]) -> float:
-    """The target network's value of the action that the online network likes best; arrays of the same shape."""
-    return float(target.flat[int(online.argmax())])
 
 
 def auc(values: npt.NDArray[np.float32], positive: npt.NDArray[np.bool_]) -> float:

@@ -1,16 +1,19 @@
 """What a rollout worker brings home."""
 
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import policy
 from policy.network import GRASP, PUSH
 from policy.training.collect import Collection, collect
 from policy.training.config import CollectSettings
 from policy.training.shard import Shard, pack_height, unpack_height
 
 SEEDS = (1_500_001, 1_500_002)
+SHIPPED = Path(policy.__file__).parent / "data" / "learned.safetensors"
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +68,14 @@ def test_heights_are_kept_to_a_tenth_of_a_millimetre():
     back = unpack_height(pack_height(heights))
     assert np.array_equal(np.isnan(back), np.isnan(heights))
     assert back == pytest.approx(heights, abs=0.6e-4, nan_ok=True)
+
+
+def test_what_was_pushed_is_grasped_at_where_it_then_lies():
+    settings = CollectSettings(grasps=0, pushes=4, states=1)
+    played = collect(Collection(2, SEEDS, SHIPPED, 0.5, settings))
+    grasps = np.flatnonzero(played.primitive == GRASP)
+    assert len(grasps)
+    for i in grasps:
+        led_here = played.next_state == played.state[i]
+        assert played.target[i] in played.target[led_here]
+        assert played.greedy[i]

@@ -132,3 +132,17 @@ def test_the_border_of_an_object_is_occupied_by_what_stands_beside_it():
     heights[30:70, 60:70] = 0.015
     assert border_occupancy(mask, heights) == 0.0
     assert border_occupancy(np.zeros_like(mask), heights) == 0.0
+
+
+def test_what_is_done_aside_is_undone(env):
+    before = env.state
+    outcomes = []
+    for _ in range(2):
+        with env.aside():
+            pushed = [env.advance(PUSH, k, middle(env, 1)) for k in range(0, 16, 2)]
+            grasped = env.attempt(GRASP, 0, middle(env, int(env.state.labels.max())))
+            assert env.state is not before
+            outcomes.append([trial.outcome for trial in (*pushed, grasped)])
+        assert env.state is before
+    assert Outcome.PUSHED in outcomes[0]
+    assert outcomes[0] == outcomes[1]
