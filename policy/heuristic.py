@@ -48,8 +48,10 @@ class HeuristicPolicy:
         targets = observation.targets()
         heightmap = observation.heightmap
         surface = estimate_surface(heightmap, self._camera, self._table_height_m)
-        table = lay_table(surface, _owners(observation), heightmap.workspace.resolution_m, self._jaw.opening_m)
-        grasp = self._best(Primitive.GRASP, find_grasps(table, targets, self._jaw), observation)
+        grasp = None
+        if observation.may_grasp:
+            table = lay_table(surface, _owners(observation), heightmap.workspace.resolution_m, self._jaw.opening_m)
+            grasp = self._best(Primitive.GRASP, find_grasps(table, targets, self._jaw), observation)
         if grasp is not None and grasp.q_value >= CLEAR_GRASP:
             return grasp
         push = self._best_push(surface, observation) if observation.may_push else None

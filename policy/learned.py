@@ -71,7 +71,7 @@ class LearnedPolicy:
         height_m = close_gaps(observation.heightmap.height_m)
         planes = encode(height_m, observation.heightmap.color)
         may_push = observation.may_push and self._may_push
-        grasp = self._grasp(observation, planes, targets, height_m)
+        grasp = self._grasp(observation, planes, targets, height_m) if observation.may_grasp else None
         failed = sum(action.primitive is Primitive.GRASP for action in observation.barred)
         trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
         if may_push and trusted < _GRASP_THRESHOLD:

@@ -50,7 +50,8 @@ class RandomPolicy:
         """
         targets = observation.targets()
         heights = estimate_surface(observation.heightmap, self._camera, self._table_height_m).height_m
-        order = [Primitive.GRASP, Primitive.PUSH] if observation.may_push else [Primitive.GRASP]
+        allowed = {Primitive.GRASP: observation.may_grasp, Primitive.PUSH: observation.may_push}
+        order = [primitive for primitive in Primitive if allowed[primitive]]
         self._generator.shuffle(order)
         for primitive in order:
             action = self._draw(primitive, targets, heights, observation)

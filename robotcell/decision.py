@@ -58,9 +58,11 @@ class Observation:
     Attributes:
         heightmap: the table as the last frame showed it.
         labels: (H, W) int32, cells that hold an object carry its number from 1, all others 0.
-        goal: (H, W) bool, cells of the goal object, or None when any object will do.
+        goal: (H, W) bool, cells of the goal object, or None when any object will do. Where the goal is hidden, the
+            cells of what may lie on it.
         barred: actions that failed on the scene as it stands; the policy is not to repeat them.
         may_push: whether a push is allowed now.
+        may_grasp: whether a grasp is; what lies on a goal is pushed aside and not picked.
     """
 
     heightmap: Heightmap
@@ -68,6 +70,7 @@ class Observation:
     goal: npt.NDArray[np.bool_] | None
     barred: tuple[Action, ...]
     may_push: bool
+    may_grasp: bool = True
 
     @property
     def objects(self) -> npt.NDArray[np.bool_]:

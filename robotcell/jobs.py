@@ -27,7 +27,10 @@ from robotcell.safety import check_config, check_plan
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy.typing as npt
+
     from robotcell.cell import Cell
+    from robotcell.config import CellConfig
     from robotcell.interfaces import RgbdFrame
     from robotcell.primitives import MotionPlan
 
@@ -190,7 +193,8 @@ def run_job(
 ) -> Report:
     """Pick the goals (colours) in their order, or with None everything on the table.
 
-    A goal that is not on the table when its turn comes ends the job; the report's reason lists what is there.
+    A goal that is not on the table when its turn comes ends the job; the report's reason lists what is there. What
+    hides a goal that was seen before is pushed aside.
 
     Raises:
         ConfigError: the configuration does not fit together, or the folder of the run cannot be made.
@@ -264,14 +268,24 @@ class _Job:
     def _pick_until(self, goal: str | None, view: View) -> tuple[View, str]:
         """Act until the goal (or, with None, everything) is picked; the last view, and why it was given up."""
         failures = pushes = 0
+        # Where the goal may be if it is not seen any more.
+        place: npt.NDArray[np.bool_] | None = None
         barred: tuple[Action, ...] = ()
         while goal is not None or view.segmentation.instances:
+            may_push = pushes < MAX_PUSHES_IN_A_ROW
             try:
-                observation = _observe(view, goal, barred, may_push=pushes < MAX_PUSHES_IN_A_ROW)
+                try:
+                    observation = _observe(view, goal, barred, may_push=may_push)
+                    place = observation.goal
+                except NoTarget:
+                    if place is None or not may_push:
+                        raise
+                    observation = _uncover(view, place, barred)
                 action = self.policy.decide(observation)
             except NoTarget as error:
                 return view, str(error)
             view, outcome = self._act(goal, view, action)
+            place = None if place is None else _whereabouts(place, action, outcome, self.cell.config)
             pushes = pushes + 1 if action.primitive is Primitive.PUSH else 0
             # A push that moved something is no failure, but only a pick is what the attempts are for.
             if outcome.result is Result.PICKED:
@@ -417,6 +431,35 @@ def _observe(view: View, goal: str | None, barred: tuple[Action, ...], *, may_pu
     labels = view.segmentation.labels
     goal_mask = labels == find_goal(view.segmentation, goal).label if goal is not None else None
     return Observation(view.heightmap, labels, goal_mask, barred, may_push)
+
+
+def _uncover(view: View, place: npt.NDArray[np.bool_], barred: tuple[Action, ...]) -> Observation:
+    """What the policy is shown to push aside what hides a goal.
+
+    Raises:
+        NoTarget: nothing is seen where the goal may be.
+    """
+    labels = view.segmentation.labels
+    hiding = (labels > 0) & np.isin(labels, np.unique(labels[place]))
+    if not hiding.any():
+        raise NoTarget("the goal is not seen any more, and nothing hides the place where it was; look for it by hand")
+    return Observation(view.heightmap, labels, hiding, barred, may_push=True, may_grasp=False)
+
+
+def _whereabouts(
+    place: npt.NDArray[np.bool_], action: Action, outcome: Outcome, config: CellConfig
+) -> npt.NDArray[np.bool_] | None:
+    """(H, W) where a goal may be after an action, having been at `place`; None if it may be anywhere."""
+    if outcome.result in {Result.LOST, Result.UNCONFIRMED}:
+        return None
+    if action.primitive is Primitive.GRASP:
+        return place
+    length = round(config.motion.push_m / config.workspace.resolution_m)
+    trace = np.zeros((2 * length + 1, 2 * length + 1), np.uint8)
+    # Dilation reads the trace backwards.
+    tip = (round(length * (1 - np.cos(action.theta))), round(length * (1 - np.sin(action.theta))))
+    cv2.line(trace, (length, length), tip, 1)
+    return np.asarray(cv2.dilate(place.astype(np.uint8), trace) > 0)
 
 
 def _taken(decision: Decision, after: View) -> Instance | None:

@@ -63,6 +63,15 @@ def packed_goal():
     return scene, goal
 
 
+def test_what_may_not_be_grasped_is_pushed(policy):
+    scene = Scene()
+    goal = scene.box(MIDDLE)
+    scene.box((MIDDLE[0] + 0.05, MIDDLE[1]), color="blue")
+    observation = scene.look(goal)
+    assert policy.decide(observation).primitive is Primitive.GRASP
+    assert policy.decide(replace(observation, may_grasp=False)).primitive is Primitive.PUSH
+
+
 def finger_cells(scene, action):
     """Cells under the open fingers."""
     reach = (CONFIG.gripper.preshape_m + linkage.FINGER_THICKNESS_M) / 2

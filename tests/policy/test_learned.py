@@ -86,6 +86,14 @@ def test_a_doubtful_grasp_waits_for_a_push(network, observation):
     assert decide(network, observation, may_push=False).primitive is Primitive.GRASP
 
 
+def test_what_may_not_be_grasped_is_pushed(network, observation):
+    put(network.grasp, 5, 110, 115, 0.95)
+    network.push[0, 112, 112] = 0.1
+    assert decide(network, replace(observation, may_grasp=False)).primitive is Primitive.PUSH
+    with pytest.raises(NoTarget):
+        decide(network, replace(observation, may_grasp=False), may_push=False)
+
+
 def test_a_likely_grasp_is_not_delayed(network, observation):
     put(network.grasp, 5, 110, 115, 0.9)
     network.push[0, 112, 112] = 1.0

@@ -1,5 +1,6 @@
 import math
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -50,6 +51,11 @@ def test_draws_are_spread_over_primitives_cells_and_rotations():
     on_first = [scene.labels[a.row, a.col] == 1 for a in actions if a.primitive is Primitive.GRASP]
     assert np.mean(on_first) == pytest.approx(625 / 1025, abs=0.08)  # by area
     assert {action.q_value for action in actions} == {0.0}
+
+
+def test_what_may_not_be_grasped_is_pushed():
+    policy, scene = make_policy("random", CONFIG), replace(look(*PAIR, goal=1), may_grasp=False)
+    assert {policy.decide(scene).primitive for _ in range(20)} == {Primitive.PUSH}
 
 
 @settings(max_examples=30)

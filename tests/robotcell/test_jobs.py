@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from policy import make_policy
+from robotcell import jobs
 from robotcell.cell import Cell, open_cell
 from robotcell.config import CellConfig, load_config
 from robotcell.decision import Action, Observation, Primitive
@@ -16,7 +17,7 @@ from robotcell.errors import CalibrationError, DeviceFault, GuardTripped, NoTarg
 from robotcell.executor import Ending, Execution, Executor
 from robotcell.jobs import Decision, Outcome, Report, Result, View, judge, look, run_job
 from robotcell.journal import Journal
-from robotcell.perception import find_goal
+from robotcell.perception import Instance, Segmentation, find_goal
 from robotcell.primitives import plan_action
 from robotcell.safety import CheckedPlan, check_plan
 
@@ -143,11 +144,7 @@ def test_ten_failures_in_a_row_end_the_run(config: CellConfig) -> None:
 
 
 def test_five_pushes_in_a_row_are_the_most(config: CellConfig) -> None:
-    def push(observation: Observation) -> Action:
-        row, col = observation.heightmap.workspace.cell(-0.6, -0.15)
-        return Action(Primitive.PUSH, row, col, 0, (-0.6, -0.15, 0.05), 1.0)
-
-    policy = Scripted([push] * 5 + [grasp_at(*RED)])
+    policy = Scripted([push_at(-0.6, -0.15)] * 5 + [grasp_at(*RED)])
     run(config, policy, ("red",))
     assert [observation.may_push for observation in policy.seen] == [True] * 5 + [False]
 
@@ -157,6 +154,68 @@ def test_a_goal_that_is_not_there_ends_the_job_and_lists_what_is(config: CellCon
     assert results == [Result.PICKED]
     assert not report.completed
     assert report.reason == "no green object is seen on the table; there is: blue"
+
+
+def push_at(x: float, y: float, z: float = 0.05, rotation: int = 0) -> Callable[[Observation], Action]:
+    def act(observation: Observation) -> Action:
+        row, col = observation.heightmap.workspace.cell(x, y)
+        return Action(Primitive.PUSH, row, col, rotation, (x, y, z), 1.0)
+
+    return act
+
+
+def hide_goal(monkeypatch: pytest.MonkeyPatch, looks: set[int]) -> None:
+    """At these looks, counted from 0, the goal is not seen; what lies there is."""
+    count = iter(range(100))
+
+    def find(segmentation: Segmentation, color: str) -> Instance:
+        if next(count) in looks:
+            raise NoTarget(f"no {color} object is seen on the table")
+        return find_goal(segmentation, color)
+
+    monkeypatch.setattr(jobs, "find_goal", find)
+
+
+def test_what_hides_a_goal_is_pushed_aside_and_never_picked(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hide_goal(monkeypatch, {1, 2})
+    # Beside red, along red to where blue stands, and back.
+    pushes = [push_at(-0.6, 0.06, rotation=12), push_at(-0.6, 0.0), push_at(-0.6, 0.0)]
+    policy = Scripted([*pushes, grasp_at(*RED)])
+    report, results, _ = run(config, policy, ("red",))
+    assert [observation.may_grasp for observation in policy.seen] == [True, False, False, True]
+    assert report.completed, (report.reason, results)
+    for observation in policy.seen[1:3]:
+        assert observation.may_push
+        assert observation.goal is not None
+        # What stands where the goal may have gone is what may lie on it.
+        assert observation.goal[observation.heightmap.workspace.cell(*RED)]
+
+
+def test_a_hidden_goal_is_looked_for_where_a_push_may_have_taken_it(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hide_goal(monkeypatch, {1})
+    # 0.1 m in the direction of -y, away from both cubes: from red's place the way reaches blue.
+    policy = Scripted([push_at(-0.65, 0.06, rotation=12)])
+    run(config, policy, ("red",))
+    goal = policy.seen[1].goal
+    assert goal is not None
+    workspace = policy.seen[1].heightmap.workspace
+    assert goal[workspace.cell(*RED)]
+    assert goal[workspace.cell(*BLUE)]
+
+
+def test_a_goal_that_was_lost_on_its_way_is_not_searched_for(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hide_goal(monkeypatch, {1})
+    monkeypatch.setattr(jobs, "judge", lambda *_: Outcome(Result.LOST, None, "dropped", 0.0))
+    policy = Scripted([grasp_at(-0.4, 0.0)] * 2)
+    report, results, _ = run(config, policy, ("red",))
+    assert results == [Result.LOST]
+    assert report.reason == "no red object is seen on the table"
 
 
 def test_two_looks_at_an_untouched_heap_show_no_push() -> None:
