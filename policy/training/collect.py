@@ -35,6 +35,8 @@ _GREEDY_SHARE = 0.4
 _AMONG_BEST = 300
 # A cell for a push is drawn at most so often.
 _PUSH_TRIES = 25
+# After so many pushes of a state, the grasp that they allow is tried.
+_FOLLOWED = 6
 # Where no network decides yet: this share of the grasps is drawn from those that look possible.
 _GEOMETRIC_SHARE = 0.5
 # A state whose best grasp succeeds is left by it, or by a push with this probability (stage I, stage II).
@@ -179,8 +181,11 @@ def _play(
             maps = _Maps(*(_q(network, state, objects, primitive) for primitive in (GRASP, PUSH)))
         picks: list[_Choice] = []
         useful: list[_Choice] = []
+        followed = 0
         for choice in _choices(state, maps, collection, config, rng):
-            trial = _try(env, choice, here, network, rng, book)
+            follow = network is not None and choice.primitive == PUSH and followed < _FOLLOWED
+            trial = _try(env, choice, here, network if follow else None, rng, book)
+            followed += follow and trial.outcome is Outcome.PUSHED
             if trial.held:
                 picks.append(choice)
             elif trial.outcome is Outcome.PUSHED:
@@ -199,8 +204,8 @@ def _play(
 def _try(
     env: PushGraspEnv, choice: _Choice, here: int, network: Inference | None, rng: np.random.Generator, book: _Book
 ) -> Trial:
-    """Note what a choice would come to; after a push, also what the best grasp of its object would."""
-    if choice.primitive == GRASP:
+    """Note what a choice would come to; with a network, also what the best grasp of the pushed object then would."""
+    if network is None:
         trial = env.attempt(choice.primitive, choice.rotation, choice.cell)
         book.add_trial(here, choice, trial)
         return trial
@@ -209,7 +214,7 @@ def _try(
         trial = env.advance(choice.primitive, choice.rotation, choice.cell)
         after = book.add_trial(here, choice, trial)
         mask = env.state.labels == target
-        if network is not None and after >= 0 and mask.any():
+        if after >= 0 and mask.any():
             grasp = _best_grasp(_q(network, env.state, mask, GRASP), mask, 1, rng)
             book.add_trial(after, grasp, env.attempt(grasp.primitive, grasp.rotation, grasp.cell))
     return trial

@@ -43,8 +43,8 @@ class CollectSettings(_Table):
     states: Count = 6
 
 
-class StageSettings(_Table):
-    """How long one stage is, and how it explores."""
+class StageSettings(CollectSettings):
+    """How long one stage is, how it explores, and how its scenes are played."""
 
     rounds: Count
     scenes_per_round: Count
@@ -100,7 +100,6 @@ class TrainConfig(_Table):
     scenes_per_task: Count = 2
     # Stage 2 alone, without the weights and the shards of a stage 1 (an ablation).
     single_stage: bool = False
-    collect: CollectSettings = CollectSettings()
     learning: LearningSettings = LearningSettings()
     stage1: StageSettings = StageSettings(
         rounds=5,
@@ -113,10 +112,14 @@ class TrainConfig(_Table):
     stage2: StageSettings = StageSettings(
         rounds=5,
         scenes_per_round=32,
-        updates_per_round=400,
+        updates_per_round=500,
         warmup_rounds=0,
         exploration_start=0.4,
         exploration_end=0.1,
+        # What stage I did not learn is which pushes free an object.
+        grasps=4,
+        pushes=14,
+        states=5,
     )
 
     def stage(self, number: int) -> StageSettings:

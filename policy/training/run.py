@@ -199,7 +199,7 @@ def _train(
         if replay.attempts.held_out.all():
             raise ConfigError(
                 f"{folder / 'shards'}: the scenes of round {round_} gave nothing to learn from; set a larger "
-                "scenes_per_round, collect.grasps or collect.pushes, and train into another --run folder"
+                "scenes_per_round, grasps or pushes, and train into another --run folder"
             )
         learned = _learn(learner, replay, round_, plan.updates_per_round * (round_ + 1), on_progress)
         metrics: Metrics = {
@@ -253,7 +253,7 @@ def _collect(
                 seeds=seeds[first : first + step],
                 weights=weights,
                 exploration=config.exploration(stage, round_),
-                settings=config.collect,
+                settings=config.stage(stage),
             )
     places = list(missing)
     done, attempts = len(paths) - len(missing), 0

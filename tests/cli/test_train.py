@@ -18,14 +18,13 @@ if TYPE_CHECKING:
 # The first scene of all is held out, so two are the fewest that can be learned from.
 CONFIG = """
 scenes_per_task = 1
-[collect]
-grasps = 2
-pushes = 1
-states = 1
 [learning]
 grasps = 2
 pushes = 2
 [stage1]
+grasps = 2
+pushes = 1
+states = 1
 rounds = 1
 scenes_per_round = 2
 updates_per_round = 1

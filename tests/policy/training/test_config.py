@@ -37,10 +37,10 @@ def test_the_example_is_valid() -> None:
 
 def test_every_wrong_value_is_named(tmp_path: Path) -> None:
     path = tmp_path / "train.toml"
-    path.write_text("sead = 1\n[learning]\ngamma = 1.5\ngrasps = 0\n[stage1]\nrounds = 0\n[collect]\nstates = nan\n")
+    path.write_text("sead = 1\n[learning]\ngamma = 1.5\ngrasps = 0\n[stage1]\nrounds = 0\n[stage2]\nstates = nan\n")
     with pytest.raises(ConfigError, match="5 wrong value") as caught:
         load_train_config(path)
-    for key in ("sead", "learning.gamma", "learning.grasps", "stage1.rounds", "collect.states"):
+    for key in ("sead", "learning.gamma", "learning.grasps", "stage1.rounds", "stage2.states"):
         assert key in str(caught.value)
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
-from policy.training.config import CollectSettings, LearningSettings, StageSettings, TrainConfig
+from policy.training.config import LearningSettings, StageSettings, TrainConfig
 from policy.training.run import prepare, read_metrics, train
 from policy.training.shard import Shard
 from policy.weights import load_weights
@@ -24,11 +24,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 STAGE = StageSettings(
-    rounds=3, scenes_per_round=6, updates_per_round=5, warmup_rounds=1, exploration_start=0.5, exploration_end=0.1
+    rounds=3,
+    scenes_per_round=6,
+    updates_per_round=5,
+    warmup_rounds=1,
+    exploration_start=0.5,
+    exploration_end=0.1,
+    grasps=6,
+    pushes=3,
 )
 CONFIG = TrainConfig(
     scenes_per_task=2,
-    collect=CollectSettings(grasps=6, pushes=3),
     learning=LearningSettings(grasps=2, pushes=2, values_per_round=5, capacity_states=30),
     stage1=STAGE,
     stage2=STAGE.model_copy(update={"rounds": 1, "warmup_rounds": 0}),
