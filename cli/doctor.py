@@ -14,7 +14,6 @@ from cli.console import progress, report_error, results
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.doctor import Finding, Grade, examine
-from robotcell.drivers.rg2 import RG2
 from robotcell.errors import CellError
 
 if TYPE_CHECKING:
@@ -52,8 +51,7 @@ def run_recover(cell_file: Path | None, *, yes: bool) -> int:
         if not yes and not typer.confirm(question, err=True):
             progress().print("nothing was changed")
             return _SOMETHING_WRONG
-        if isinstance(cell.gripper, RG2):
-            cell.gripper.recover()
+        cell.gripper.recover()
         with progress().status("leaving the stop"), cell.arm as arm:
             arm.recover()
             mode = arm.state().mode.value

@@ -201,6 +201,15 @@ class Gripper(Device, Protocol):
         """Stop the fingers where they are."""
         ...
 
+    def recover(self) -> None:
+        """Leave a fault that holds the fingers, only because an operator asked for it. Works without a connection too.
+
+        Raises:
+            ConnectionLost: the gripper cannot be reached.
+            DeviceFault: the cause is still there.
+        """
+        ...
+
 
 class Camera(Device, Protocol):
     """An RGB-D camera."""

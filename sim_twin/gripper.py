@@ -102,6 +102,9 @@ class TwinGripper(Gripper):
         self._force_n = 0.0
         self._hold()
 
+    def recover(self) -> None:
+        """Nothing to leave: the simulated fingers have no safety switches."""
+
     def _control(self) -> None:
         """One control period: drive the cranks towards the commanded width."""
         if not self._driving:
