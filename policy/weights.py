@@ -18,6 +18,7 @@ import torch
 
 from policy.networks import make_network
 from robotcell.errors import ConfigError
+from robotcell.whole_file import replaced
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -61,10 +62,9 @@ def save_weights(path: Path, network: nn.Module, architecture: str, card: Mappin
     _check_finite(tensors, what, "the training diverged, go back to an earlier state")
     metadata = {**card, "format": _FORMAT, "architecture": architecture}
     content = safetensors.torch.save(tensors, {**metadata, "sha256": _digest(tensors, metadata)})
-    part = path.with_name(f"{path.name}.part")
     try:
-        part.write_bytes(content)
-        part.replace(path)
+        with replaced(path) as part:
+            part.write_bytes(content)
     except OSError as error:
         raise ConfigError(f"{what}: cannot be written ({error.strerror}); choose another folder") from error
 

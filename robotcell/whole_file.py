@@ -1,23 +1,45 @@
-"""Text files that are there as a whole or not at all, whatever happens while they are written."""
+"""Files that are there as a whole or not at all, whatever happens while they are written."""
 
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file; a reader, also after a crash, sees what stood there before or all of the new.
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """The file to write instead: once it is written, and on the disk, it takes the place of `path`.
+
+    A reader, also after a crash, sees what stood there before or all of the new. An error inside leaves what stood
+    there.
 
     Raises:
         OSError: it cannot be written.
     """
-    partial = path.with_name(f"{path.name}.part")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    part = path.with_name(f"{path.name}.part")
+    try:
+        yield part
+        descriptor = os.open(part, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        part.replace(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file by `replaced`.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with replaced(path) as part:
+        part.write_text(text, encoding="utf-8")

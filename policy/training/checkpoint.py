@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any
 
 import torch
 
 from robotcell.errors import ConfigError
+from robotcell.whole_file import replaced
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,12 +22,8 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
         path: of the checkpoint.
         state: tensors, numbers, strings, and dictionaries and lists of them.
     """
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        torch.save({"version": _VERSION, **state}, file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    with replaced(path) as part:
+        torch.save({"version": _VERSION, **state}, part)
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

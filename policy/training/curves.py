@@ -8,6 +8,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from robotcell.whole_file import replaced
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
@@ -43,6 +45,5 @@ def draw_curves(history: Sequence[dict[str, float]], path: Path) -> None:
             axes.set_ylim(0, 1)
         axes.legend()
     figure.axes[-1].set_yscale("log")
-    partial = path.with_suffix(".partial")
-    figure.savefig(partial, format="png", dpi=100)
-    partial.replace(path)
+    with replaced(path) as part:
+        figure.savefig(part, format="png", dpi=100)

@@ -34,7 +34,7 @@ from policy.training.replay import Replay
 from policy.training.shard import Shard
 from policy.weights import save_weights
 from robotcell.errors import ConfigError
-from robotcell.whole_file import write_whole
+from robotcell.whole_file import replaced, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -139,9 +139,8 @@ def prepare(
         (folder / "shards").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made ({error.strerror}); choose another --run") from error
-    partial = written.with_suffix(".partial")
-    save_train_config(config, partial)
-    partial.replace(written)
+    with replaced(written) as part:
+        save_train_config(config, part)
     return config
 
 
@@ -396,9 +395,8 @@ def _write_weights(
     }
     weights = folder / "weights.safetensors"
     save_weights(weights, learner.online, config.architecture, card)
-    partial = run / "weights.partial"
-    shutil.copyfile(weights, partial)
-    partial.replace(run / weights.name)
+    with replaced(run / weights.name) as part:
+        shutil.copyfile(weights, part)
 
 
 def _write_metrics(run: Path, history: list[Metrics]) -> None:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.whole_file import replaced
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -55,10 +57,8 @@ class Shard:
 
     def save(self, path: Path) -> None:
         """Write the shard so that a reader sees all of it or nothing."""
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as file:
+        with replaced(path) as part, part.open("wb") as file:
             np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
-        partial.replace(path)
 
     @staticmethod
     def load(path: Path) -> Shard:
