@@ -117,6 +117,10 @@ class Motion(_Table):
     push_m: Annotated[float, Field(ge=0.01, le=0.3)] = 0.10
     # A guarded descent that meets this force has met an object: it ends, and the grasp is given up.
     contact_force_n: Annotated[float, Field(gt=0, le=100)] = 30.0
+    # Finger tips sweep down by up to 15 mm as they close. Where that presses harder than this on what lies beneath,
+    # they open again, and the grasp is given up. Grasps that held pressed with 3 to 45 N, one of 26 with 65 N and one
+    # with 81 N (measured in the twin).
+    closing_force_n: Annotated[float, Field(gt=0, le=250)] = 70.0
 
 
 class Limits(_Table):

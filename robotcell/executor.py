@@ -38,7 +38,7 @@ class Ending(enum.Enum):
     """How a plan ended."""
 
     DONE = "done"
-    CONTACT = "contact"  # a guarded motion met something and stopped
+    CONTACT = "contact"  # a guarded motion met something and stopped, or fingers pressed too hard and opened again
     EMPTY = "empty"  # the fingers held nothing when they should
 
 
@@ -94,7 +94,9 @@ class Executor:
         step: Step | None = None
         for step in plan.steps:
             if isinstance(step, Grip):
-                self._grip(step)
+                contact, force = self._grip(step)
+                if contact:
+                    return Execution(Ending.CONTACT, step.label, force, width)
             elif isinstance(step, CheckHold):
                 width = self._cell.gripper.state().width_m
                 if width < step.min_width_m:
@@ -156,15 +158,26 @@ class Executor:
                 "then recover"
             )
 
-    def _grip(self, step: Grip) -> None:
-        """Move the fingers; the arm stands, and is watched and kept awake all the same."""
+    def _grip(self, step: Grip) -> tuple[bool, float]:
+        """Move the fingers; whether they met more than they may press on, and their largest contact force [N].
+
+        The arm stands, and is watched and kept awake all the same.
+        """
         arm, gripper, clock = self._cell.arm, self._cell.gripper, self._cell.clock
+        limit = step.contact_force_n
+        wrench_before, width_before = arm.state().wrench, gripper.state().width_m
+        peak = 0.0
         gripper.start_width(step.width_m, step.force_n)
         deadline = clock.now() + _GRIP_TIMEOUT_S
         # The first sleep lets a command reach the fingers before they are asked whether they move.
         clock.sleep(PERIOD_S)
         while gripper.state().busy:
-            self._guard.check(arm.state(), clock.now())
+            state = arm.state()
+            self._guard.check(state, clock.now())
+            peak = max(peak, float(np.linalg.norm((state.wrench - wrench_before)[:3])))
+            if limit is not None and peak > limit:
+                self._grip(Grip(f"open after {step.label!r}", width_before, step.force_n))
+                return True, peak
             arm.kick()
             if clock.now() > deadline:
                 raise DeviceFault(
@@ -172,6 +185,7 @@ class Executor:
                     "power-cycle it at the Compute Box, then recover"
                 )
             clock.sleep(PERIOD_S)
+        return False, peak
 
     def _stop(self) -> None:
         """Stop arm and fingers and wait for standstill; an arm that is lost is stopped by its own controller."""

@@ -74,11 +74,16 @@ class LinearMove:
 
 @dataclass(frozen=True)
 class Grip:
-    """A motion of the fingers, waited for."""
+    """A motion of the fingers, waited for.
+
+    Where the arm feels more than `contact_force_n` meanwhile, the fingers go back to where they were, and the plan ends
+    with `Ending.CONTACT`.
+    """
 
     label: str
     width_m: float
     force_n: float
+    contact_force_n: float | None = None
 
 
 @dataclass(frozen=True)
@@ -205,7 +210,7 @@ def _plan_grasp(action: Action, heightmap: Heightmap, q_start: Array, config: Ce
             motion.linear_acceleration_m_s2,
             contact_force_n=motion.contact_force_n,
         ),
-        Grip("close", linkage.MIN_WIDTH_M, use.force_n),
+        Grip("close", linkage.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
         LinearMove("lift", T_lifted, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
         CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
         _joint("carry to bin", q_bin, config, load_m=LOAD_REACH_M),

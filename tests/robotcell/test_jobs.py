@@ -126,6 +126,18 @@ def test_a_finger_on_an_object_ends_the_descent(config: CellConfig) -> None:
     assert not report.completed
 
 
+def test_fingers_that_press_too_hard_as_they_close_open_again(config: CellConfig) -> None:
+    config = config.model_copy(update={"motion": config.motion.model_copy(update={"closing_force_n": 1.0})})
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        report = run_job(cell, Scripted([grasp_at(RED[0] - 0.01, RED[1])]), journal, ("red",))
+        (row,) = journal.job(report.job_id).actions
+        assert row.outcome is not None
+        assert row.outcome.result == Result.COLLIDED.value
+        assert "during 'close'" in row.outcome.detail
+        assert cell.gripper.state().width_m == pytest.approx(config.gripper.preshape_m, abs=0.002)
+        find_goal(look(cell).segmentation, "red")
+
+
 def test_an_unsafe_action_is_refused_and_nothing_moves(config: CellConfig) -> None:
     with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
         q = cell.arm.state().q
