@@ -26,8 +26,6 @@ else:
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pydantic_core import ErrorDetails
-
     from robotcell.cell import Cell
 
 
@@ -40,6 +38,8 @@ def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
 Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0)]
 Vector3 = tuple[float, float, float]
+
+_DOCS = "docs/configuration.md"
 
 
 class _Table(BaseModel):
@@ -302,7 +302,7 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
     try:
         config = CellConfig.model_validate(values)
     except ValidationError as error:
-        problems += [_describe(detail, ()) for detail in error.errors()]
+        problems += wrong_values(error, _DOCS)
     backend_table = values.get("backend", {})
     if isinstance(backend_table, dict):
         try:
@@ -311,7 +311,7 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
         except ConfigError as error:
             problems.append(f"backend.name: {error}")
         except ValidationError as error:
-            problems += [_describe(detail, ("backend", "options")) for detail in error.errors()]
+            problems += wrong_values(error, _DOCS, ("backend", "options"))
     if config is None or problems:
         place = str(path) if path else "the cell's settings"
         raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
@@ -339,6 +339,26 @@ def read_toml(path: Path, example: str) -> dict[str, Any]:
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
 
 
+def wrong_values(error: ValidationError, docs: str, prefix: tuple[str, ...] = ()) -> list[str]:
+    """A line for each wrong key of a file: the key, its value and what is wrong with it.
+
+    Args:
+        error: of its validation.
+        docs: the page that lists the keys.
+        prefix: of the keys, where a part of the file was validated.
+    """
+    lines = []
+    for detail in error.errors():
+        key = ".".join(str(part) for part in (*prefix, *detail["loc"]))
+        if detail["type"] == "missing":
+            lines.append(f"{key}: missing")
+        elif detail["type"] == "extra_forbidden":
+            lines.append(f"{key} = {detail['input']!r}: unknown key; see {docs} for those that exist")
+        else:
+            lines.append(f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}")
+    return lines
+
+
 def _beside(values: dict[str, Any], path: Path) -> None:
     """A relative path of the calibration file starts at the folder of the cell's file."""
     camera = values.get("camera")
@@ -354,12 +374,3 @@ def _set(values: dict[str, Any], dotted_key: str, value: object) -> None:
             return  # the file holds something else there, which the validation reports
         values = inner
     values[key] = value
-
-
-def _describe(detail: ErrorDetails, prefix: tuple[str, ...]) -> str:
-    key = ".".join(str(part) for part in (*prefix, *detail["loc"]))
-    if detail["type"] == "extra_forbidden":
-        return f"{key} = {detail['input']!r}: unknown key; see docs/configuration.md for those that exist"
-    if detail["type"] == "missing":
-        return f"{key}: missing"
-    return f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}"

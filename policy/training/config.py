@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from robotcell.config import read_toml
+from robotcell.config import read_toml, wrong_values
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pydantic_core import ErrorDetails
 
 # Scene seeds that one stage may use before it would meet those of the next stage or of the next `seed`.
 _SEEDS_PER_STAGE = 200_000
@@ -211,12 +210,5 @@ def _validated(values: dict[str, Any], place: str) -> TrainConfig:
     try:
         return TrainConfig.model_validate(values)
     except ValidationError as error:
-        problems = [_describe(detail) for detail in error.errors()]
+        problems = wrong_values(error, "docs/training.md")
         raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems])) from None
-
-
-def _describe(detail: ErrorDetails) -> str:
-    key = ".".join(str(part) for part in detail["loc"])
-    if detail["type"] == "extra_forbidden":
-        return f"{key} = {detail['input']!r}: unknown key; see docs/training.md for those that exist"
-    return f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}"
