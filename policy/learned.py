@@ -10,11 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.encoding import encode
+from policy.foresight import Foresight
 from policy.grasping import Jaw, finger_reach, finger_room, lay_table
 from policy.network import GRASP, PUSH
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
-from policy.selection import best_cells, check_maps, faded, push_mask, pushes, surface_at
+from policy.selection import Candidate, best_cells, check_maps, faded, push_mask, pushes, surface_at
 from policy.surface import cell_centers, estimate_surface
 from robotcell.decision import Action, Primitive
 from robotcell.errors import NoTarget
@@ -34,6 +35,12 @@ _TRUST = 0.6
 # not, this share of the value is left.
 _LOOKED_AT = 400
 _BLOCKED = 0.05
+
+
+# Pushes are played ahead: what they free of the border counts, and their Q with this weight.
+_Q_SHARE = 0.1
+# A push that frees this much of the border comes before any doubtful grasp (paper: tau of the reward).
+_USEFUL_GAIN = 0.1
 
 
 class LearnedPolicy:
@@ -76,8 +83,8 @@ class LearnedPolicy:
         trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
         if may_push and trusted < _GRASP_THRESHOLD:
             push = self._push(observation, planes, targets, height_m)
-            if push is not None and (grasp is None or push.q_value > trusted):
-                return push
+            if push is not None and (grasp is None or push[1] > _USEFUL_GAIN or push[0].q_value > trusted):
+                return push[0]
         if grasp is not None:
             return grasp
         raise NoTarget(
@@ -115,19 +122,35 @@ class LearnedPolicy:
         planes: npt.NDArray[np.float32],
         targets: npt.NDArray[np.bool_],
         height_m: npt.NDArray[np.float32],
-    ) -> Action | None:
+    ) -> tuple[Action, float] | None:
+        """The best push, and how much of its object's border it frees when it is played ahead."""
         workspace = observation.heightmap.workspace
         free = free_to_descend(height_m, workspace)
         mask = push_mask(targets, observation.objects)
         q = self._inference.maps(planes, mask, PUSH)
         check_maps(q, mask, "push")
-        for k, value, line in pushes(q, mask, height_m, free, self._push_m, workspace.resolution_m):
-            x, y = self._position(observation, line.row, line.col)
-            at = np.array([x]), np.array([y])
-            if repeats(Primitive.PUSH, *at, np.array([k]), observation.barred).any():
+        foresight = Foresight(observation.labels, height_m, workspace.resolution_m)
+        single = observation.goal is not None and observation.may_grasp
+        best: tuple[float, float, Candidate] | None = None
+        for push in pushes(q, mask, height_m, free, self._push_m, workspace.resolution_m):
+            x, y = workspace.position(push.line.row, push.line.col)
+            if repeats(
+                Primitive.PUSH, np.array([x]), np.array([y]), np.array([push.rotation]), observation.barred
+            ).any():
                 continue
-            return Action(Primitive.PUSH, line.row, line.col, k, (x, y, self._table_height_m + line.top_m), value)
-        return None
+            result = foresight.play(push.line, push.rotation)
+            # Without a goal, whatever the push goes through is what it is to free.
+            label = int(observation.labels[targets].max() if single else observation.labels[push.cell])
+            gain = foresight.freed(label, result)
+            worth = gain + _Q_SHARE * push.q - result.lost
+            if best is None or worth > best[0]:
+                best = worth, gain, push
+        if best is None:
+            return None
+        _, gain, push = best
+        x, y = workspace.position(push.line.row, push.line.col)
+        xyz = (x, y, self._table_height_m + push.line.top_m)
+        return Action(Primitive.PUSH, push.line.row, push.line.col, push.rotation, xyz, push.q), gain
 
     @staticmethod
     def _position(observation: Observation, row: int, col: int) -> tuple[float, float]:

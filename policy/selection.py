@@ -6,7 +6,7 @@ from them (Hadamard product), dilated for pushes; the action is the argmax.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,17 +14,17 @@ import numpy.typing as npt
 
 from policy.push_line import PushLine, push_line
 from robotcell.errors import ConfigError
-from robotcell.perception import MIN_OBJECT_M
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 # Paper: 15 dilations of 3x3.
 _DILATIONS = 15
-# Cells of the push maps that are tried in the order of their value before pushing is given up.
-_PUSH_TRIES = 2000
-# What is pushed stays this far inside the workspace.
-_RIM_M = 0.02
+# Pushes of a rotation that are proposed, and the cells of its map that are tried for them in the order of their value;
+# how far these, and the places where the pushes begin, lie apart [cells].
+_PER_ROTATION = 4
+_PUSH_TRIES = 60
+_APART = 3
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
 # network, and at an edge the fingers slip. Standard deviation in cells.
 _SMOOTH_CELLS = 1.5
@@ -76,6 +76,15 @@ def best_cells(
         yield int(k), int(row), int(col), float(values[i])
 
 
+class Candidate(NamedTuple):
+    """A push that may be chosen: rotation, cell of the push map, its Q, and the way of the fingers."""
+
+    rotation: int
+    cell: tuple[int, int]
+    q: float
+    line: PushLine
+
+
 def pushes(
     q: npt.NDArray[np.float32],
     mask: npt.NDArray[np.bool_],
@@ -83,36 +92,24 @@ def pushes(
     free: npt.NDArray[np.bool_],
     push_m: float,
     resolution_m: float,
-) -> Iterator[tuple[int, float, PushLine]]:
-    """Pushes through cells of a mask that have a place to begin: rotation, Q, line.
+) -> Iterator[Candidate]:
+    """Pushes through cells of a mask (H, W) that have a place to begin: of each rotation the most valuable few.
 
-    The most valuable first of those that leave what they push in the workspace; then of the others.
+    Of those that begin side by side only the first.
     """
-    others = []
-    for k, row, col, value in best_cells(q, mask, _PUSH_TRIES):
-        line = push_line(height_m, free, (row, col), k, push_m, resolution_m)
-        if line is None:
-            continue
-        if _stays_inside(line, height_m, resolution_m):
-            yield k, value, line
-        else:
-            others.append((k, value, line))
-    yield from others
-
-
-def _stays_inside(line: PushLine, height_m: npt.NDArray[np.float32], resolution_m: float) -> bool:
-    """Whether what stands in the way of a push would still be in the workspace at its end.
-
-    All that stands on the line, also beyond its end, is taken to be swept together in front of the fingers.
-    """
-    first, last = line.cells[0], line.cells[-1]
-    length = max(1, len(line.cells) - 1)
-    steps = np.arange(max(height_m.shape) * 2)
-    ray = np.rint(first + (last - first) / length * steps[:, None]).astype(np.intp)
-    inside = ((ray >= 0) & (ray < height_m.shape)).all(axis=1)
-    ray = ray[: int(inside.argmin())] if not inside.all() else ray
-    swept = np.count_nonzero(height_m[ray[:, 0], ray[:, 1]] > MIN_OBJECT_M)
-    return bool(length + swept + _RIM_M / resolution_m <= len(ray))
+    lattice = np.zeros_like(mask)
+    lattice[::_APART, ::_APART] = True
+    cells = mask & lattice if (mask & lattice).any() else mask
+    for k in range(len(q)):
+        places = set()
+        for _, row, col, value in best_cells(q[k : k + 1], cells, _PUSH_TRIES):
+            line = push_line(height_m, free, (row, col), k, push_m, resolution_m)
+            if line is None or (place := (line.row // _APART, line.col // _APART)) in places:
+                continue
+            yield Candidate(k, (row, col), value, line)
+            places.add(place)
+            if len(places) == _PER_ROTATION:
+                break
 
 
 def surface_at(height_m: npt.NDArray[np.float32], cell: tuple[int, int]) -> float:

@@ -109,7 +109,7 @@ class TrainConfig(_Table):
         exploration_end=0.1,
     )
     stage2: StageSettings = StageSettings(
-        rounds=5,
+        rounds=4,
         scenes_per_round=32,
         updates_per_round=500,
         warmup_rounds=0,

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from policy.border import border_occupancy
 from policy.encoding import CHANNELS, encode
 from policy.network import GRASP, PUSH
 from policy.push_line import PushLine, free_to_descend, push_line
@@ -40,10 +41,7 @@ if TYPE_CHECKING:
 
     from robotcell.geometry import Array
 
-# Paper, stage II: the border is 10 dilations wide; a cell of it from 2 cm to 30 cm high is occupied; a push that gains
-# more than tau of the border earns the reward.
-_BORDER_DILATIONS = 10
-_OCCUPIED_M = (0.02, 0.30)
+# Paper, stage II: a push that gains more than tau of the border earns the reward.
 GAIN_TAU = 0.1
 PUSH_REWARD = 0.5
 # Stage I: a push scatters when the objects' borders are freed by this much on average over all that moved.
@@ -362,21 +360,6 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         return self._world
 
 
-def border_occupancy(mask: npt.NDArray[np.bool_], height_m: npt.NDArray[np.float32]) -> float:
-    """Share of the cells around an object that something stands on (paper, stage II: m_r)."""
-    rows, cols = np.nonzero(mask)
-    if not len(rows):
-        return 0.0
-    pad = _BORDER_DILATIONS + 1
-    window = (slice(max(0, rows.min() - pad), rows.max() + pad), slice(max(0, cols.min() - pad), cols.max() + pad))
-    inner = mask[window].astype(np.uint8)
-    border = (cv2.dilate(inner, np.ones((3, 3), np.uint8), iterations=_BORDER_DILATIONS) > 0) & (inner == 0)
-    heights = height_m[window][border]
-    with np.errstate(invalid="ignore"):
-        occupied = (heights > _OCCUPIED_M[0]) & (heights < _OCCUPIED_M[1])
-    return float(occupied.mean()) if len(heights) else 0.0
-
-
 def _moved(
     before: list[tuple[tuple[float, ...], tuple[float, ...]]], after: list[tuple[tuple[float, ...], tuple[float, ...]]]
 ) -> npt.NDArray[np.intp]:
@@ -384,4 +367,4 @@ def _moved(
     return np.flatnonzero(np.linalg.norm(a - b, axis=1) > _MOVED_M)
 
 
-__all__ = ["GRASP", "PUSH", "Outcome", "PushGraspEnv", "State", "Trial", "border_occupancy"]
+__all__ = ["GRASP", "PUSH", "Outcome", "PushGraspEnv", "State", "Trial"]

@@ -52,6 +52,13 @@ def observation():
     return Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
 
 
+@pytest.fixture
+def alone(observation):
+    heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
+    heights[GOAL], labels[GOAL] = 0.05, 1
+    return Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+
+
 def decide(network, observation, **options):
     return LearnedPolicy(CONFIG, network, "learned", **options).decide(observation)
 
@@ -75,15 +82,43 @@ def test_without_a_goal_the_best_object_is_taken(network, observation):
 
 def test_a_doubtful_grasp_waits_for_a_push(network, observation):
     put(network.grasp, 5, 110, 115, 0.2)
-    network.push[0, 112, 112] = 0.8
+    network.push[0, 105:120, 105:120] = 0.8
     action = decide(network, observation)
-    assert (action.primitive, action.rotation) == (Primitive.PUSH, 0)
-    # The fingers come down behind the block that the cell is on.
-    assert action.row == 112
-    assert action.col < 100
+    assert action.primitive is Primitive.PUSH
     assert action.xyz[2] == pytest.approx(0.05)
     assert decide(network, replace(observation, may_push=False)).primitive is Primitive.GRASP
     assert decide(network, observation, may_push=False).primitive is Primitive.GRASP
+
+
+def test_what_a_push_frees_counts_more_than_its_q(network, observation):
+    put(network.grasp, 5, 110, 115, 0.2)
+    network.push[0, 105:120, 105:120] = 0.8  # takes the neighbour along
+    network.push[8, 130:145, 130:145] = 0.7  # pushes it against the goal
+    action = decide(network, observation)
+    assert action.rotation not in {0, 8}
+
+
+def test_among_pushes_that_free_alike_the_q_decides(network, alone):
+    put(network.grasp, 5, 110, 115, 0.2)
+    for k, value in ((0, 0.8), (4, 0.9)):
+        network.push[k, 105:120, 105:120] = value
+    action = decide(network, alone)
+    assert (action.primitive, action.rotation, action.q_value) == (Primitive.PUSH, 4, pytest.approx(0.9))
+    # The fingers come down behind the block that the cell is on.
+    assert action.row < 100
+    assert 105 <= action.col < 120
+
+
+def test_what_would_be_lost_is_not_pushed(network, observation):
+    # At the edge of the map, with no neighbour.
+    heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
+    heights[100:125, 190:215], labels[100:125, 190:215] = 0.05, 1
+    edge = Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+    network.grasp[0, 110, 200] = network.push[0, 110, 200] = 0.01
+    network.push[0, 105:120, 195:210] = 0.9
+    network.push[8, 105:120, 195:210] = 0.3
+    network.push[4, 105:120, 195:210] = 0.5
+    assert decide(network, edge).rotation == 4
 
 
 def test_what_may_not_be_grasped_is_pushed(network, observation):
@@ -105,7 +140,7 @@ def test_a_failed_action_is_not_repeated(network, observation):
     put(network.grasp, 5, 112, 117, 0.8)  # 5 mm further on
     put(network.grasp, 3, 112, 110, 0.7)
     first = decide(network, observation)
-    second = decide(network, replace(observation, barred=(first,)))
+    second = decide(network, replace(observation, barred=(first,), may_push=False))
     assert (first.rotation, second.rotation) == (5, 3)
 
 
@@ -123,12 +158,12 @@ def test_a_lone_peak_is_no_grasp(network, observation):
     assert action.col == pytest.approx(118, abs=1)
 
 
-def test_a_failed_push_is_not_repeated(network, observation):
+def test_a_failed_push_is_not_repeated(network, alone):
     put(network.grasp, 5, 110, 115, 0.1)
-    network.push[0, 112, 112] = 0.9
-    network.push[4, 112, 112] = 0.8
-    first = decide(network, observation)
-    second = decide(network, replace(observation, barred=(first,)))
+    network.push[0, 111:114, 111:114] = 0.9
+    network.push[4, 111:114, 111:114] = 0.8
+    first = decide(network, alone)
+    second = decide(network, replace(alone, barred=(first,)))
     assert (first.rotation, second.rotation) == (0, 4)
 
 

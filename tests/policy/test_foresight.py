@@ -1,0 +1,113 @@
+"""Pushes played ahead."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from policy.foresight import Foresight
+from policy.push_line import free_to_descend, push_line
+from robotcell.config import CellConfig
+
+CONFIG = CellConfig()
+RESOLUTION_M = CONFIG.workspace.resolution_m
+PUSH_M = CONFIG.motion.push_m
+
+
+class Table:
+    """Boxes of cells on a bare table."""
+
+    def __init__(self, *boxes, height_m=0.05):
+        self.height_m = np.zeros(CONFIG.workspace.shape, np.float32)
+        self.labels = np.zeros(CONFIG.workspace.shape, np.int32)
+        for label, (row, col, rows, cols, *higher) in enumerate(boxes, start=1):
+            place = slice(row, row + rows), slice(col, col + cols)
+            self.height_m[place], self.labels[place] = (higher or [height_m])[0], label
+
+    def push(self, cell, rotation):
+        free = free_to_descend(self.height_m, CONFIG.workspace)
+        line = push_line(self.height_m, free, cell, rotation, PUSH_M, RESOLUTION_M)
+        assert line is not None
+        foresight = Foresight(self.labels, self.height_m, RESOLUTION_M)
+        return foresight, line, foresight.play(line, rotation)
+
+
+def shift(played, label, cell):
+    """How far the middle of an object goes [m], along x and y."""
+    before = (np.array(cell[::-1]) + 0.5) * RESOLUTION_M
+    move = played.moves[label]
+    return move[:, :2] @ before + move[:, 2] - before
+
+
+@settings(max_examples=16, derandomize=True, deadline=None)
+@given(rotation=st.integers(0, 15))
+def test_a_block_goes_with_the_fingers_and_its_neighbours_stay(rotation):
+    table = Table((100, 100, 25, 25), (20, 20, 25, 25))
+    _, line, played = table.push((112, 112), rotation)
+    assert set(played.moves) == {1}
+    theta = 2 * math.pi * rotation / 16
+    way = shift(played, 1, (112, 112))
+    gap = np.hypot(112 - line.row, 112 - line.col) * RESOLUTION_M
+    # From where the fingers meet it, which are 10 mm long on that side; at a corner it also turns.
+    expected = PUSH_M - (gap - 0.010 - 0.025)
+    assert way @ (math.cos(theta), math.sin(theta)) == pytest.approx(expected, abs=0.012)
+    assert abs(way @ (-math.sin(theta), math.cos(theta))) < 0.02
+    assert not played.lost
+
+
+def test_a_push_beside_the_middle_turns_the_block():
+    _, _, played = Table((100, 100, 25, 25)).push((120, 112), 0)
+    angle = math.atan2(played.moves[1][1, 0], played.moves[1][0, 0])
+    # Pushed at larger y, towards +x: clockwise in a frame whose z is up.
+    assert angle < -0.2
+
+
+def test_what_is_met_on_the_way_is_pushed_on():
+    _, _, played = Table((100, 60, 25, 25), (100, 95, 25, 25)).push((112, 72), 0)
+    assert set(played.moves) == {1, 2}
+    first, second = shift(played, 1, (112, 72)), shift(played, 2, (112, 107))
+    assert 0 < second[0] < first[0]
+
+
+def test_fingers_pass_over_what_is_lower_than_their_tips():
+    table = Table((100, 60, 25, 25, 0.10), (100, 95, 25, 25, 0.03))
+    foresight, _, played = table.push((112, 72), 0)
+    assert set(played.moves) == {1}
+    assert foresight.freed(1, played) < 0.1  # it stands over the low one now
+
+
+def test_a_push_away_from_a_neighbour_frees_the_border():
+    table = Table((100, 100, 25, 25), (100, 126, 25, 25))
+    foresight, _, away = table.push((112, 112), 4)
+    assert foresight.freed(1, away) > 0.15
+    assert foresight.freed(2, away) > 0.15
+    _, _, together = table.push((112, 112), 0)
+    assert foresight.freed(1, together) == pytest.approx(0, abs=0.05)
+
+
+def test_an_object_without_neighbours_has_nothing_to_be_freed_of():
+    foresight, _, played = Table((100, 100, 25, 25)).push((112, 112), 3)
+    assert foresight.freed(1, played) == 0.0
+    assert foresight.freed(7, played) == 0.0
+
+
+def test_what_ends_at_the_rim_may_be_lost():
+    assert Table((100, 180, 25, 25)).push((112, 192), 0)[2].lost
+    assert not Table((100, 180, 25, 25)).push((112, 192), 8)[2].lost
+
+
+def test_the_same_push_gives_the_same():
+    table = Table((100, 100, 25, 25), (90, 127, 25, 25), (126, 100, 20, 40))
+    plays = [table.push((105, 105), 1)[2].moves for _ in range(2)]
+    assert plays[0].keys() == plays[1].keys()
+    assert all(np.array_equal(plays[0][i], plays[1][i]) for i in plays[0])
+
+
+def test_holes_and_specks_are_no_obstacles():
+    table = Table((100, 100, 25, 25))
+    table.height_m[60:70, 60:70] = np.nan
+    table.labels[112, 150:153] = 9
+    _, _, played = table.push((112, 112), 0)
+    assert set(played.moves) == {1}
