@@ -31,13 +31,13 @@ _TABLE_FRICTION = 0.6
 _OBJECT_FRICTION = 0.6
 _FINGER_FRICTION = 0.8
 # A turning prism slides at all its cells, two thirds of its radius away on average.
-_TURNING = 1.5
+_LEVER = 2 / 3
 # Twice as fast as the arm: friction of the table makes the outcome depend on the way alone.
 _SPEED_M_S = 0.16
-_STEP_S = 1 / 120
+_STEP_S = 1 / 240
 # Outlines overlap by noise: so much is left alone, and a third of what is more goes in every step.
 _OVERLAP_M = 0.0006
-_LEFT_OVERLAP = 0.8**60
+_LEFT_OVERLAP = 0.9**240
 # An object of fewer cells is noise.
 _LEAST_CELLS = 12
 # What ends nearer to the rim of the map than this may fall out of it.
@@ -93,7 +93,7 @@ class Foresight:
         self._height_m = np.nan_to_num(height_m, nan=0.0)
         self._resolution_m = resolution_m
         self._prisms = {int(i): prism for i in np.unique(labels) if i and (prism := self._prism(int(i))) is not None}
-        self._borders: dict[int, Array] = {}
+        self._borders: dict[int, tuple[Array, float]] = {}
         low, high = OCCUPIED_M
         self._standing = (self._height_m > low) & (self._height_m < high)
 
@@ -122,16 +122,14 @@ class Foresight:
         space.add(fingers, box)
         for _ in range(round(length / _SPEED_M_S / _STEP_S)):
             space.step(_STEP_S)
-            for label, body in bodies.items():
-                _brake(body, self._prisms[label].radius)
         return self._outcome(bodies)
 
     def freed(self, label: int, played: Played) -> float:
         """How much of an object's border a push frees: the fall in the share that others stand on (paper, stage II)."""
-        border = self._border(label)
+        border, occupied = self._border(label)
         if not len(border):
             return 0.0
-        return float(self._occupied(label, border, {}).mean() - self._occupied(label, border, played.moves).mean())
+        return occupied - float(self._occupied(label, border, played.moves).mean())
 
     def _prism(self, label: int) -> _Prism | None:
         mask = (self._labels == label).astype(np.uint8)
@@ -158,12 +156,14 @@ class Foresight:
                 lost = lost or bool((after < _RIM_M).any() or (after > size - _RIM_M).any())
         return Played(moves, lost)
 
-    def _border(self, label: int) -> Array:
-        """(N, 2) x and y [m] of the cells around an object."""
+    def _border(self, label: int) -> tuple[Array, float]:
+        """(N, 2) x and y [m] of the cells around an object, and the share of them that others stand on."""
         if label not in self._borders:
             mask = (self._labels == label).astype(np.uint8)
             ring = (cv2.dilate(mask, np.ones((3, 3), np.uint8), iterations=BORDER_DILATIONS) > 0) & (mask == 0)
-            self._borders[label] = np.asarray((np.argwhere(ring)[:, ::-1] + 0.5) * self._resolution_m, np.float64)
+            border = (np.argwhere(ring)[:, ::-1] + 0.5) * self._resolution_m
+            occupied = float(self._occupied(label, border, {}).mean()) if len(border) else 0.0
+            self._borders[label] = border, occupied
         return self._borders[label]
 
     def _occupied(self, label: int, border: Array, moves: dict[int, Array]) -> npt.NDArray[np.bool_]:
@@ -195,16 +195,11 @@ def _add(space: pymunk.Space, prism: _Prism) -> pymunk.Body:
     shape = pymunk.Poly(body, corners)
     shape.friction = _OBJECT_FRICTION
     body.position = (float(prism.center[0]), float(prism.center[1]))
-    space.add(body, shape)
+    # Coulomb's friction of the table: joints that may slip, and pull back to no place.
+    weight = _TABLE_FRICTION * _GRAVITY_M_S2 * mass
+    drag = pymunk.PivotJoint(space.static_body, body, (0, 0), (0, 0))
+    drag.max_bias, drag.max_force = 0.0, weight
+    twist = pymunk.GearJoint(space.static_body, body, 0.0, 1.0)
+    twist.max_bias, twist.max_force = 0.0, _LEVER * prism.radius * weight
+    space.add(body, shape, drag, twist)
     return body
-
-
-def _brake(body: pymunk.Body, radius_m: float) -> None:
-    """Friction of the table for one step."""
-    slower = _TABLE_FRICTION * _GRAVITY_M_S2 * _STEP_S
-    speed = body.velocity.length
-    if speed > 0:
-        body.velocity = body.velocity * max(0.0, 1 - slower / speed)
-    turning = body.angular_velocity
-    if turning:
-        body.angular_velocity = math.copysign(max(0.0, abs(turning) - _TURNING * slower / radius_m), turning)
