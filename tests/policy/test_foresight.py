@@ -58,7 +58,7 @@ def test_a_block_goes_with_the_fingers_and_its_neighbours_stay(rotation):
 
 
 def test_a_push_beside_the_middle_turns_the_block():
-    _, _, played = Table((100, 100, 25, 25)).push((120, 112), 0)
+    _, _, played = Table((100, 100, 25, 25)).push((124, 112), 0)
     angle = math.atan2(played.moves[1][1, 0], played.moves[1][0, 0])
     # Pushed at larger y, towards +x: clockwise in a frame whose z is up.
     assert angle < -0.2
