@@ -38,7 +38,7 @@ _BLOCKED = 0.05
 
 
 # Pushes are played ahead: what they free of the border counts, and their Q with this weight.
-_Q_SHARE = 0.1
+_Q_SHARE = 0.3
 # A push that frees this much of the border comes before any doubtful grasp (paper: tau of the reward).
 _USEFUL_GAIN = 0.1
 

@@ -23,7 +23,7 @@ _DILATIONS = 15
 # Pushes of a rotation that are proposed, and the cells of its map that are tried for them in the order of their value;
 # how far these, and the places where the pushes begin, lie apart [cells].
 _PER_ROTATION = 4
-_PUSH_TRIES = 60
+_PUSH_TRIES = 400
 _APART = 3
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
 # network, and at an edge the fingers slip. Standard deviation in cells.
