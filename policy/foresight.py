@@ -41,8 +41,8 @@ _OVERLAP_M = 0.0006
 _LEFT_OVERLAP = 0.9**240
 # An object of fewer cells is noise.
 _LEAST_CELLS = 12
-# What ends nearer to the rim of the map than this may fall out of it.
-_RIM_M = 0.02
+# What is pushed nearer to the rim of the map than this may leave it, or leaves no room for a finger.
+_RIM_M = 0.03
 # The fingers pass over what is lower than their tips, with so much to spare.
 _CLEAR_M = 0.002
 
@@ -73,7 +73,7 @@ class Played:
 
     Attributes:
         moves: (2, 3) by label of each object that moved: the map's x and y [m] before to those after.
-        lost: whether one of them may have left the workspace.
+        lost: whether one of them came so near to the rim of the workspace that it may leave it.
     """
 
     moves: dict[int, Array]
@@ -154,7 +154,11 @@ class Foresight:
             after = move[:, :2] @ before + move[:, 2]
             if np.abs(after - before).max() > self._resolution_m / 4 or abs(sin) > 0.02:
                 moves[label] = move
-                lost = lost or bool((after < _RIM_M).any() or (after > size - _RIM_M).any())
+                outline = self._prisms[label].outline
+                margin_before, margin = (
+                    min(xy.min(), (size - xy).min()) for xy in (outline, outline @ move[:, :2].T + move[:, 2])
+                )
+                lost = lost or bool(margin < min(_RIM_M, margin_before))
         return Played(moves, lost)
 
     def _border(self, label: int) -> tuple[Array, float]:
