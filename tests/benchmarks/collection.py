@@ -18,7 +18,7 @@ from policy.training.shard import Shard
 
 SCENES = 16
 FIRST_SEED = 1_400_000
-SETTINGS = CollectSettings()
+SETTINGS = CollectSettings(grasps=12, pushes=4)
 
 
 def ten_objects(seed: int) -> Shard:
