@@ -82,9 +82,11 @@ class LearnedPolicy:
         failed = sum(action.primitive is Primitive.GRASP for action in observation.barred)
         trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
         if may_push and trusted < _GRASP_THRESHOLD:
-            push = self._push(observation, planes, targets, height_m)
-            if push is not None and (grasp is None or push[1] > _USEFUL_GAIN or push[0].q_value > trusted):
-                return push[0]
+            found = self._push(observation, planes, targets, height_m)
+            if found is not None:
+                push, gain = found
+                if grasp is None or gain > _USEFUL_GAIN or push.q_value > trusted:
+                    return push
         if grasp is not None:
             return grasp
         raise NoTarget(
