@@ -1,8 +1,7 @@
 """What a push would do, played ahead on the plane of the table: objects as prisms that slide, turn and touch.
 
 The physics is Chipmunk's (pymunk), seen from above, with the table's friction added as Coulomb's. It knows nothing of
-toppling and stacks. Measured on 39 blocked goals of the twin: pushes that free more than a tenth of a border are told
-from others with an area under the ROC of 0.8, by the Q values of a network with 0.6 to 0.7.
+toppling and stacks.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pymunk
 
-from policy.border import BORDER_DILATIONS, OCCUPIED_M
+from policy.border import border_cells, stands
 from robotcell import linkage
 from robotcell.decision import ROTATIONS
 
@@ -31,12 +30,12 @@ _TABLE_FRICTION = 0.6
 _OBJECT_FRICTION = 0.6
 _FINGER_FRICTION = 0.8
 # Share of the radius at which friction acts against turning: two thirds for a disc that only turns, less for what
-# slides as well (0.3 tells the pushes of the twin apart best of 0.03 to 0.67).
+# slides as well. Set by comparing plays with the twin.
 _LEVER = 0.3
 # Twice as fast as the arm: friction of the table makes the outcome depend on the way alone.
 _SPEED_M_S = 0.16
 _STEP_S = 1 / 240
-# Outlines overlap by noise: so much is left alone, and a third of what is more goes in every step.
+# Outlines overlap by noise: so much is left alone, and a tenth of what is more goes in every step.
 _OVERLAP_M = 0.0006
 _LEFT_OVERLAP = 0.9**240
 # An object of fewer cells is noise.
@@ -95,8 +94,7 @@ class Foresight:
         self._resolution_m = resolution_m
         self._prisms = {int(i): prism for i in np.unique(labels) if i and (prism := self._prism(int(i))) is not None}
         self._borders: dict[int, tuple[Array, float]] = {}
-        low, high = OCCUPIED_M
-        self._standing = (self._height_m > low) & (self._height_m < high)
+        self._standing = stands(self._height_m)
 
     def play(self, line: PushLine, rotation: int) -> Played:
         """Move the closed fingers along a push."""
@@ -150,10 +148,9 @@ class Foresight:
             cos, sin = math.cos(body.angle), math.sin(body.angle)
             turn = np.array([[cos, -sin], [sin, cos]])
             # The body's frame was at the middle of the outline.
-            move = np.column_stack([turn, np.array([body.position.x, body.position.y]) - turn @ before])
-            after = move[:, :2] @ before + move[:, 2]
+            after = np.array([body.position.x, body.position.y])
             if np.abs(after - before).max() > self._resolution_m / 4 or abs(sin) > 0.02:
-                moves[label] = move
+                move = moves[label] = np.column_stack([turn, after - turn @ before])
                 outline = self._prisms[label].outline
                 margin_before, margin = (
                     min(xy.min(), (size - xy).min()) for xy in (outline, outline @ move[:, :2].T + move[:, 2])
@@ -164,9 +161,7 @@ class Foresight:
     def _border(self, label: int) -> tuple[Array, float]:
         """(N, 2) x and y [m] of the cells around an object, and the share of them that others stand on."""
         if label not in self._borders:
-            mask = (self._labels == label).astype(np.uint8)
-            ring = (cv2.dilate(mask, np.ones((3, 3), np.uint8), iterations=BORDER_DILATIONS) > 0) & (mask == 0)
-            border: Array = ((np.argwhere(ring)[:, ::-1] + 0.5) * self._resolution_m).astype(np.float64)
+            border = np.asarray((border_cells(self._labels == label)[:, ::-1] + 0.5) * self._resolution_m, np.float64)
             occupied = float(self._occupied(label, border, {}).mean()) if len(border) else 0.0
             self._borders[label] = border, occupied
         return self._borders[label]

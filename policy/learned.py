@@ -133,25 +133,22 @@ class LearnedPolicy:
         check_maps(q, mask, "push")
         foresight = Foresight(observation.labels, height_m, workspace.resolution_m)
         single = observation.goal is not None and observation.may_grasp
+        goal = int(observation.labels[targets].max()) if single else None
         best: tuple[float, float, Candidate] | None = None
         for push in pushes(q, mask, height_m, free, self._push_m, workspace.resolution_m):
-            x, y = workspace.position(push.line.row, push.line.col)
-            if repeats(
-                Primitive.PUSH, np.array([x]), np.array([y]), np.array([push.rotation]), observation.barred
-            ).any():
+            x, y = (np.array([v]) for v in self._position(observation, push.line.row, push.line.col))
+            if repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
                 continue
             result = foresight.play(push.line, push.rotation)
             # Without a goal, whatever the push goes through is what it is to free.
-            label = int(observation.labels[targets].max() if single else observation.labels[push.cell])
-            gain = foresight.freed(label, result)
+            gain = foresight.freed(int(observation.labels[push.cell]) if goal is None else goal, result)
             worth = gain + _Q_SHARE * push.q - result.lost
             if best is None or worth > best[0]:
                 best = worth, gain, push
         if best is None:
             return None
         _, gain, push = best
-        x, y = workspace.position(push.line.row, push.line.col)
-        xyz = (x, y, self._table_height_m + push.line.top_m)
+        xyz = (*self._position(observation, push.line.row, push.line.col), self._table_height_m + push.line.top_m)
         return Action(Primitive.PUSH, push.line.row, push.line.col, push.rotation, xyz, push.q), gain
 
     @staticmethod

@@ -274,16 +274,12 @@ class _Job:
         while goal is not None or view.segmentation.instances:
             may_push = pushes < MAX_PUSHES_IN_A_ROW
             try:
-                try:
-                    observation = _observe(view, goal, barred, may_push=may_push)
-                    place = observation.goal
-                except NoTarget:
-                    if place is None or not may_push:
-                        raise
-                    observation = _uncover(view, place, barred)
+                observation = _observe(view, goal, barred, place, may_push=may_push)
                 action = self.policy.decide(observation)
             except NoTarget as error:
                 return view, str(error)
+            if observation.may_grasp:
+                place = observation.goal
             view, outcome = self._act(goal, view, action)
             place = None if place is None else _whereabouts(place, action, outcome, self.cell.config)
             pushes = pushes + 1 if action.primitive is Primitive.PUSH else 0
@@ -422,14 +418,28 @@ def _judge_grasp(decision: Decision, after: View, execution: Execution) -> Outco
     return Outcome(Result.PICKED, picked, f"{picked}, held {width} wide", force)
 
 
-def _observe(view: View, goal: str | None, barred: tuple[Action, ...], *, may_push: bool) -> Observation:
-    """What the policy is shown.
+def _observe(
+    view: View,
+    goal: str | None,
+    barred: tuple[Action, ...],
+    place: npt.NDArray[np.bool_] | None = None,
+    *,
+    may_push: bool,
+) -> Observation:
+    """What the policy is shown; `place` is where a goal may be that is not seen any more.
 
     Raises:
-        NoTarget: the goal is not on the table.
+        NoTarget: the goal is not on the table, or nothing can be done to uncover it.
     """
     labels = view.segmentation.labels
-    goal_mask = labels == find_goal(view.segmentation, goal).label if goal is not None else None
+    if goal is None:
+        return Observation(view.heightmap, labels, None, barred, may_push)
+    try:
+        goal_mask = labels == find_goal(view.segmentation, goal).label
+    except NoTarget:
+        if place is None or not may_push:
+            raise
+        return _uncover(view, place, barred)
     return Observation(view.heightmap, labels, goal_mask, barred, may_push)
 
 
