@@ -42,6 +42,23 @@ def test_an_object_in_two_pieces_is_not_graspable(monkeypatch):
         assert is_graspable.__wrapped__(0) is expected
 
 
+def test_walls_around_nothing_are_not_graspable(monkeypatch):
+    cube = block("cube").mesh
+    thin = tuple(
+        Mesh(cube.vertices * np.roll([1, 1, 0.02], axis) + 0.025 * side * np.roll([0, 0, 1], axis), cube.triangles)
+        for axis in range(3)
+        for side in (-1, 1)
+    )
+    shape = shape_of("box without a core", thin)
+    monkeypatch.setattr("sim_twin.novel.novel_shape", lambda _: shape)
+    assert not is_graspable.__wrapped__(0)
+
+
+@pytest.mark.parametrize("number", [552, 703])
+def test_files_of_slivers_are_not_graspable(number):
+    assert not is_graspable(number)
+
+
 def test_a_file_without_a_shape_is_not_graspable():
     # Its vertices are NaN in the package.
     assert not is_graspable(168)
