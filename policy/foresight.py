@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pymunk
+from scipy.ndimage import find_objects
 
 from policy.border import border_cells, stands
 from robotcell import linkage
@@ -34,36 +35,44 @@ _FINGER_FRICTION = 0.8
 _LEVER = 0.3
 # Twice as fast as the arm: friction of the table makes the outcome depend on the way alone.
 _SPEED_M_S = 0.16
-_STEP_S = 1 / 240
+_STEP_S = 1 / 120
 # Outlines overlap by noise: so much is left alone, and a tenth of what is more goes in every step.
 _OVERLAP_M = 0.0006
-_LEFT_OVERLAP = 0.9**240
+_LEFT_OVERLAP = 0.9**120
+# An outline that fills less of its hull is concave, and halved until its pieces are not, or too small to matter.
+_CONVEX = 0.82
+_LEAST_PART_CELLS = 9
 # An object of fewer cells is noise.
 _LEAST_CELLS = 12
-# What is pushed nearer to the rim of the map than this may leave it, or leaves no room for a finger.
+# What is pushed nearer to the rim of the map than this, and not just along it, may leave it or leaves no room for a
+# finger.
 _RIM_M = 0.03
+# The window of an object shows so much around it: farther than fingers that grasp it reach, and than its border.
+_AROUND_M = 0.07
+_STAYS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 # The fingers pass over what is lower than their tips, with so much to spare.
 _CLEAR_M = 0.002
 
 
 @dataclass(frozen=True)
 class _Prism:
-    """An object: `outline` (N, 2) convex, x and y in metres from the map's corner, and its height."""
+    """An object: convex `parts`, each (N, 2) x and y in metres from the map's corner, their middle, and its height."""
 
-    outline: Array
+    parts: tuple[Array, ...]
+    center: Array
     height_m: float
 
     @cached_property
-    def area(self) -> float:
-        return float(cv2.contourArea(self.outline.astype(np.float32)))
+    def outline(self) -> Array:
+        return np.concatenate(self.parts)
+
+    @cached_property
+    def areas(self) -> tuple[float, ...]:
+        return tuple(float(cv2.contourArea(part.astype(np.float32))) for part in self.parts)
 
     @cached_property
     def radius(self) -> float:
-        return math.sqrt(self.area / math.pi)
-
-    @cached_property
-    def center(self) -> Array:
-        return np.asarray(self.outline.mean(axis=0))
+        return math.sqrt(sum(self.areas) / math.pi)
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,24 @@ class Played:
     lost: bool
 
 
+_NOTHING = Played({}, lost=False)
+
+
+class Window(NamedTuple):
+    """The part of the map around an object.
+
+    Attributes:
+        top, left: row and column of the map at its first cell; negative where it reaches beyond the map.
+        own: (h, w) cells of the object.
+        border: (N, 2) row and column, in the window, of the cells around the object.
+    """
+
+    top: int
+    left: int
+    own: npt.NDArray[np.bool_]
+    border: npt.NDArray[np.intp]
+
+
 class Foresight:
     """The objects of one view.
 
@@ -92,9 +119,11 @@ class Foresight:
         self._labels = labels
         self._height_m = np.nan_to_num(height_m, nan=0.0)
         self._resolution_m = resolution_m
-        self._prisms = {int(i): prism for i in np.unique(labels) if i and (prism := self._prism(int(i))) is not None}
-        self._borders: dict[int, tuple[Array, float]] = {}
-        self._standing = stands(self._height_m)
+        boxes = find_objects(labels)
+        self._cells = {i: (box, labels[box] == i) for i, box in enumerate(boxes, start=1) if box is not None}
+        self._prisms = {i: prism for i in self._cells if (prism := self._prism(i)) is not None}
+        self._windows: dict[int, Window] = {}
+        self._occupied: dict[int, float] = {}
 
     def play(self, line: PushLine, rotation: int) -> Played:
         """Move the closed fingers along a push."""
@@ -123,83 +152,145 @@ class Foresight:
             space.step(_STEP_S)
         return self._outcome(bodies)
 
-    def freed(self, label: int, played: Played) -> float:
-        """How much of an object's border a push frees: the fall in the share that others stand on (paper, stage II)."""
-        border, occupied = self._border(label)
-        if not len(border):
-            return 0.0
-        return occupied - float(self._occupied(label, border, played.moves).mean())
+    def window(self, label: int) -> Window:
+        """What is seen of an object and of what stands around it."""
+        if label not in self._windows:
+            (rows, cols), own = self._cells[label]
+            pad = math.ceil(_AROUND_M / self._resolution_m)
+            border = border_cells(np.pad(own, pad))
+            self._windows[label] = Window(rows.start - pad, cols.start - pad, np.pad(own, pad), border)
+        return self._windows[label]
+
+    def around(self, label: int, played: Played) -> npt.NDArray[np.float32]:
+        """(h, w) heights in the window of an object after a push; the window goes and turns with the object."""
+        window = self.window(label)
+        here = played.moves.get(label, _STAYS)
+        rest = self._height_m.copy()
+        for gone in {*played.moves, label}:
+            box, cells = self._cells[gone]
+            rest[box][cells] = 0.0
+        heights = self._seen(rest, (0, 0), window, here)
+        for other, move in played.moves.items():
+            if other != label:
+                (rows, cols), cells = self._cells[other]
+                alone = np.where(cells, self._height_m[rows, cols], np.float32(0))
+                seen = self._seen(alone, (rows.start, cols.start), window, _then(here, _inverse(move)))
+                np.maximum(heights, seen, out=heights)
+        box, cells = self._cells[label]
+        heights[window.own] = self._height_m[box][cells]
+        return heights
+
+    def freed(self, label: int, around: npt.NDArray[np.float32]) -> float:
+        """How much of an object's border a push frees: the fall in the share that others stand on (paper, stage II).
+
+        Args:
+            label: of the object.
+            around: what the push makes of its window.
+        """
+        if label not in self._occupied:
+            self._occupied[label] = self._share(label, self.around(label, _NOTHING))
+        return self._occupied[label] - self._share(label, around)
+
+    def _share(self, label: int, around: npt.NDArray[np.float32]) -> float:
+        rows, cols = self.window(label).border.T
+        return float(stands(around[rows, cols]).mean())
+
+    def _seen(
+        self, height_m: npt.NDArray[np.float32], corner: tuple[int, int], window: Window, move: Array
+    ) -> npt.NDArray[np.float32]:
+        """Heights as the window shows them.
+
+        Args:
+            height_m: a part of the map.
+            corner: row and column of its first cell.
+            window: of an object.
+            move: (2, 3) from x and y [m] in the window to those of the part.
+        """
+        turn = move[:, :2]
+        half = np.array([window.left + 0.5, window.top + 0.5])
+        shift = turn @ half + move[:, 2] / self._resolution_m - 0.5 - np.array(corner[::-1])
+        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        size = window.own.shape[::-1]
+        return np.asarray(cv2.warpAffine(height_m, np.column_stack([turn, shift]), size, flags=flags), np.float32)
 
     def _prism(self, label: int) -> _Prism | None:
-        mask = (self._labels == label).astype(np.uint8)
-        if np.count_nonzero(mask) < _LEAST_CELLS:
+        (rows, cols), own = self._cells[label]
+        if np.count_nonzero(own) < _LEAST_CELLS:
             return None
-        contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        hull = cv2.convexHull(max(contours, key=cv2.contourArea))[:, 0].astype(np.float64)
-        prism = _Prism((hull + 0.5) * self._resolution_m, float(np.percentile(self._height_m[mask > 0], 90)))
-        return prism if prism.area > 0 else None
+        corner = np.array([cols.start, rows.start]) + 0.5
+        parts = tuple((part + corner) * self._resolution_m for part in _convex_parts(own))
+        middle = np.argwhere(own).mean(axis=0)[::-1]
+        height_m = float(np.percentile(self._height_m[rows, cols][own], 90))
+        return _Prism(parts, (middle + corner) * self._resolution_m, height_m) if parts else None
 
     def _outcome(self, bodies: dict[int, pymunk.Body]) -> Played:
         moves, lost = {}, False
-        rows, cols = self._labels.shape
-        size = np.array([cols, rows]) * self._resolution_m
         for label, body in bodies.items():
-            before = self._prisms[label].center
+            prism = self._prisms[label]
+            before = prism.center
             cos, sin = math.cos(body.angle), math.sin(body.angle)
-            turn = np.array([[cos, -sin], [sin, cos]])
             # The body's frame was at the middle of the outline.
             after = np.array([body.position.x, body.position.y])
             if np.abs(after - before).max() > self._resolution_m / 4 or abs(sin) > 0.02:
-                move = moves[label] = np.column_stack([turn, after - turn @ before])
-                outline = self._prisms[label].outline
-                margin_before, margin = (
-                    min(xy.min(), (size - xy).min()) for xy in (outline, outline @ move[:, :2].T + move[:, 2])
-                )
-                lost = lost or bool(margin < min(_RIM_M, margin_before))
+                turn = np.array([[cos, -sin], [sin, cos]])
+                moves[label] = move = np.column_stack([turn, after - turn @ before])
+                margin = self._margin(prism.outline @ move[:, :2].T + move[:, 2])
+                lost = lost or margin < min(_RIM_M, self._margin(prism.outline) - self._resolution_m)
         return Played(moves, lost)
 
-    def _border(self, label: int) -> tuple[Array, float]:
-        """(N, 2) x and y [m] of the cells around an object, and the share of them that others stand on."""
-        if label not in self._borders:
-            border = np.asarray((border_cells(self._labels == label)[:, ::-1] + 0.5) * self._resolution_m, np.float64)
-            occupied = float(self._occupied(label, border, {}).mean()) if len(border) else 0.0
-            self._borders[label] = border, occupied
-        return self._borders[label]
+    def _margin(self, outline: Array) -> float:
+        """Distance [m] from the rim of the map, negative beyond it."""
+        size = np.array(self._labels.shape[::-1]) * self._resolution_m
+        return float(min(outline.min(), (size - outline).min()))
 
-    def _occupied(self, label: int, border: Array, moves: dict[int, Array]) -> npt.NDArray[np.bool_]:
-        """(N,) whether something else stands on the border, which goes with its object."""
-        if label in moves:
-            border = border @ moves[label][:, :2].T + moves[label][:, 2]
-        owner, standing = self._at(border)
-        taken = standing & ~np.isin(owner, [label, *moves])
-        for other, move in moves.items():
-            if other != label:
-                owner, standing = self._at((border - move[:, 2]) @ move[:, :2])
-                taken |= standing & (owner == other)
-        return np.asarray(taken)
 
-    def _at(self, xy: Array) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.bool_]]:
-        """Which object is at (N, 2) places, and whether anything stands there."""
-        col, row = np.floor(xy / self._resolution_m).astype(np.intp).T
-        rows, cols = self._labels.shape
-        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-        row, col = np.where(inside, row, 0), np.where(inside, col, 0)
-        return np.where(inside, self._labels[row, col], 0), inside & self._standing[row, col]
+def _then(first: Array, second: Array) -> Array:
+    """Two moves (2, 3), one after the other."""
+    return np.column_stack([second[:, :2] @ first[:, :2], second[:, :2] @ first[:, 2] + second[:, 2]])
+
+
+def _inverse(move: Array) -> Array:
+    back = move[:, :2].T
+    return np.column_stack([back, -back @ move[:, 2]])
+
+
+def _convex_parts(own: npt.NDArray[np.bool_]) -> list[Array]:
+    """Convex polygons, each (N, 2) column and row, that cover an object (h, w): its hull, or those of its halves."""
+    parts: list[Array] = []
+    contours, _ = cv2.findContours(own.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    for contour in contours:
+        hull = cv2.convexHull(contour)
+        area = cv2.contourArea(hull)
+        if area < _LEAST_PART_CELLS:
+            continue
+        if cv2.contourArea(contour) > _CONVEX * area:
+            parts.append(hull[:, 0].astype(np.float64))
+            continue
+        col, row, cols, rows = cv2.boundingRect(contour)
+        for half in range(2):
+            window = [slice(row, row + rows), slice(col, col + cols)]
+            axis, middle = (0, row + rows // 2) if rows > cols else (1, col + cols // 2)
+            window[axis] = slice(window[axis].start, middle) if half == 0 else slice(middle, window[axis].stop)
+            corner = np.array([window[1].start, window[0].start])
+            parts += [part + corner for part in _convex_parts(own[tuple(window)])]
+    return parts
 
 
 def _add(space: pymunk.Space, prism: _Prism) -> pymunk.Body:
-    corners = [(float(x), float(y)) for x, y in prism.outline - prism.center]
+    parts = [[(float(x), float(y)) for x, y in part - prism.center] for part in prism.parts]
     # The density is the same for all, and its value without meaning.
-    mass = prism.area * prism.height_m
-    body = pymunk.Body(mass, pymunk.moment_for_poly(mass, corners))
-    shape = pymunk.Poly(body, corners)
-    shape.friction = _OBJECT_FRICTION
+    masses = [area * prism.height_m for area in prism.areas]
+    moment = sum(pymunk.moment_for_poly(mass, part) for mass, part in zip(masses, parts, strict=True))
+    body = pymunk.Body(sum(masses), moment)
     body.position = (float(prism.center[0]), float(prism.center[1]))
+    shapes = [pymunk.Poly(body, part) for part in parts]
+    for shape in shapes:
+        shape.friction = _OBJECT_FRICTION
     # Coulomb's friction of the table: joints that may slip, and pull back to no place.
-    weight = _TABLE_FRICTION * _GRAVITY_M_S2 * mass
+    weight = _TABLE_FRICTION * _GRAVITY_M_S2 * body.mass
     drag = pymunk.PivotJoint(space.static_body, body, (0, 0), (0, 0))
     drag.max_bias, drag.max_force = 0.0, weight
     twist = pymunk.GearJoint(space.static_body, body, 0.0, 1.0)
     twist.max_bias, twist.max_force = 0.0, _LEVER * prism.radius * weight
-    space.add(body, shape, drag, twist)
+    space.add(body, *shapes, drag, twist)
     return body

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from policy.encoding import encode
 from policy.foresight import Foresight
 from policy.grasping import Jaw, finger_reach, finger_room, lay_table
 from policy.network import GRASP, PUSH
+from policy.prospects import Prospects
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
 from policy.selection import Candidate, best_cells, check_maps, faded, push_mask, pushes, surface_at
@@ -28,19 +29,40 @@ if TYPE_CHECKING:
 
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
 # the goal's mask is below a threshold).
-_GRASP_THRESHOLD = 0.75
+_GRASP_THRESHOLD = 0.6
+# Where no push near the targets has a place to begin, the mask grows by the same again, up to so many times in all.
+_PUSH_REACHES = 3
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
-# So many of the best grasps are looked at for whether the fingers come down beside what stands around; where they do
-# not, this share of the value is left.
+# So many of the best grasps are looked at for whether the fingers come down beside what stands around. The network
+# has seen that as well: their room, no less than the one, to the power of the other makes its Q the share of grasps
+# that succeed (measured).
 _LOOKED_AT = 400
 _BLOCKED = 0.05
-
-
-# Pushes are played ahead: what they free of the border counts, and their Q with this weight.
-_Q_SHARE = 0.3
+_ROOM_POWER = 0.2
+# Pushes are played ahead: how well the object can be grasped then counts, and with these weights what is freed of its
+# border, the push's Q, and that something may be lost.
+_GAIN_SHARE = 0.3
+_Q_SHARE = 0.1
+_LOSS = 0.3
 # A push that frees this much of the border comes before any doubtful grasp (paper: tau of the reward).
 _USEFUL_GAIN = 0.1
+
+
+class _Push(NamedTuple):
+    """A push that was played ahead: what it frees of its object's border, what it promises, and a loss."""
+
+    candidate: Candidate
+    gain: float
+    promise: float
+    loses: bool
+
+    def worth(self) -> float:
+        return self.promise + _GAIN_SHARE * self.gain + _Q_SHARE * self.candidate.q - _LOSS * self.loses
+
+    def is_better_than(self, grasp: float) -> bool:
+        """Whether it comes before a grasp of that value."""
+        return self.gain > _USEFUL_GAIN or max(self.promise, self.candidate.q) > grasp
 
 
 class LearnedPolicy:
@@ -82,11 +104,9 @@ class LearnedPolicy:
         failed = sum(action.primitive is Primitive.GRASP for action in observation.barred)
         trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
         if may_push and trusted < _GRASP_THRESHOLD:
-            found = self._push(observation, planes, targets, height_m)
-            if found is not None:
-                push, gain = found
-                if grasp is None or gain > _USEFUL_GAIN or push.q_value > trusted:
-                    return push
+            push = self._push(observation, planes, targets, height_m)
+            if push is not None and (grasp is None or push.is_better_than(trusted)):
+                return self._push_action(observation, push.candidate)
         if grasp is not None:
             return grasp
         raise NoTarget(
@@ -104,18 +124,18 @@ class LearnedPolicy:
         q = self._inference.maps(planes, targets, GRASP)
         check_maps(q, targets, "grasp")
         mask = _allowed(Primitive.GRASP, observation, targets, len(q))
-        best = list(best_cells(faded(q, targets), mask, _LOOKED_AT))
-        if not best:
+        rotation, rows, cols, values = best_cells(faded(q, targets), mask, _LOOKED_AT)
+        if not len(values):
             return None
-        rotation, rows, cols, values = (np.array(column) for column in zip(*best, strict=True))
         heightmap = observation.heightmap
         near = cv2.dilate(targets.astype(np.uint8), self._reach) > 0
         surface = estimate_surface(heightmap, self._camera, self._table_height_m, near)
         table = lay_table(surface, observation.labels, heightmap.workspace.resolution_m, self._jaw.opening_m)
-        values = values * np.maximum(finger_room(table, rows, cols, rotation, self._jaw), _BLOCKED)
+        room = np.maximum(finger_room(table, rows, cols, rotation, self._jaw), np.float32(_BLOCKED))
+        values = values * room**_ROOM_POWER
         chosen = int(values.argmax())
         row, col = int(rows[chosen]), int(cols[chosen])
-        xyz = (*self._position(observation, row, col), self._table_height_m + surface_at(height_m, (row, col)))
+        xyz = (*heightmap.workspace.position(row, col), self._table_height_m + surface_at(height_m, (row, col)))
         return Action(Primitive.GRASP, row, col, int(rotation[chosen]), xyz, float(values[chosen]))
 
     def _push(
@@ -124,36 +144,41 @@ class LearnedPolicy:
         planes: npt.NDArray[np.float32],
         targets: npt.NDArray[np.bool_],
         height_m: npt.NDArray[np.float32],
-    ) -> tuple[Action, float] | None:
-        """The best push, and how much of its object's border it frees when it is played ahead."""
-        workspace = observation.heightmap.workspace
-        free = free_to_descend(height_m, workspace)
-        mask = push_mask(targets, observation.objects)
-        q = self._inference.maps(planes, mask, PUSH)
-        check_maps(q, mask, "push")
-        foresight = Foresight(observation.labels, height_m, workspace.resolution_m)
+    ) -> _Push | None:
+        """The best push near the targets, or farther from them where none has a place to begin."""
+        heightmap = observation.heightmap
+        resolution_m = heightmap.workspace.resolution_m
+        free = free_to_descend(height_m, heightmap.workspace)
+        foresight = Foresight(observation.labels, height_m, resolution_m)
+        prospects = Prospects(
+            self._inference, foresight, observation.labels, height_m, heightmap.color, self._jaw, resolution_m
+        )
         single = observation.goal is not None and observation.may_grasp
         goal = int(observation.labels[targets].max()) if single else None
-        best: tuple[float, float, Candidate] | None = None
-        for push in pushes(q, mask, height_m, free, self._push_m, workspace.resolution_m):
-            x, y = (np.array([v]) for v in self._position(observation, push.line.row, push.line.col))
-            if repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
-                continue
-            result = foresight.play(push.line, push.rotation)
-            # Without a goal, whatever the push goes through is what it is to free.
-            gain = foresight.freed(int(observation.labels[push.cell]) if goal is None else goal, result)
-            worth = gain + _Q_SHARE * push.q - result.lost
-            if best is None or worth > best[0]:
-                best = worth, gain, push
-        if best is None:
-            return None
-        _, gain, push = best
-        xyz = (*self._position(observation, push.line.row, push.line.col), self._table_height_m + push.line.top_m)
-        return Action(Primitive.PUSH, push.line.row, push.line.col, push.rotation, xyz, push.q), gain
+        mask = targets
+        for _ in range(_PUSH_REACHES):
+            mask = push_mask(mask | targets, observation.objects)
+            q = self._inference.maps(planes, mask, PUSH)
+            check_maps(q, mask, "push")
+            found: list[_Push] = []
+            for push in pushes(q, mask, height_m, free, self._push_m, resolution_m):
+                x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
+                if repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
+                    continue
+                played = foresight.play(push.line, push.rotation)
+                # Without a goal, whatever the push goes through is what it is to free.
+                label = int(observation.labels[push.cell]) if goal is None else goal
+                around = foresight.around(label, played)
+                gain, promise = foresight.freed(label, around), prospects.after(label, around)
+                found.append(_Push(push, gain, promise, played.lost))
+            if found:
+                return max(found, key=_Push.worth)
+        return None
 
-    @staticmethod
-    def _position(observation: Observation, row: int, col: int) -> tuple[float, float]:
-        return observation.heightmap.workspace.position(row, col)
+    def _push_action(self, observation: Observation, push: Candidate) -> Action:
+        line = push.line
+        xyz = (*observation.heightmap.workspace.position(line.row, line.col), self._table_height_m + line.top_m)
+        return Action(Primitive.PUSH, line.row, line.col, push.rotation, xyz, push.q)
 
 
 def _allowed(

@@ -20,6 +20,7 @@ from robotcell.perception import MIN_OBJECT_M
 
 if TYPE_CHECKING:
     from robotcell.config import Workspace
+    from robotcell.geometry import Array
 
 # Room that the closed fingers need to come down: half their diagonal, and 1 mm for noise and calibration.
 _FREE_RADIUS_M = 0.016
@@ -63,6 +64,25 @@ def free_to_descend(height_m: npt.NDArray[np.float32], workspace: Workspace) -> 
     return np.asarray(grown == 0)
 
 
+def push_starts(
+    free: npt.NDArray[np.bool_], cells: npt.NDArray[np.intp], rotation: int, push_m: float, resolution_m: float
+) -> npt.NDArray[np.intp]:
+    """(N, 2) row and column at which pushes through cells (N, 2) begin, -1 where there is no place.
+
+    Going back from a cell, the fingers come down at the first place that is free for them.
+    """
+    length = round(push_m / resolution_m)
+    back = np.arange(length - round(_FOLLOW_M / resolution_m) + 1)
+    places = np.rint(cells[:, :, None] - _direction(rotation)[:, None] * back).astype(np.intp)
+    # Once outside of the map, a way back does not return to it.
+    inside = np.all((places >= 0) & (places < np.array(free.shape)[:, None]), axis=1)
+    row, col = np.where(inside[:, None], places, 0).swapaxes(0, 1)
+    possible = np.logical_and(inside, free[row, col])
+    first = possible.argmax(axis=1)
+    found = possible.any(axis=1)
+    return np.where(found[:, None], places[np.arange(len(cells)), :, first], -1)
+
+
 def push_line(
     height_m: npt.NDArray[np.float32],
     free: npt.NDArray[np.bool_],
@@ -71,28 +91,32 @@ def push_line(
     push_m: float,
     resolution_m: float,
 ) -> PushLine | None:
-    """The push of length `push_m` in direction `rotation` through a cell; None where there is none.
+    """The push of length `push_m` in direction `rotation` through a cell; None where there is none."""
+    row, col = push_starts(free, np.array([cell]), rotation, push_m, resolution_m)[0]
+    return None if row < 0 else line_from(height_m, (int(row), int(col)), rotation, push_m, resolution_m)
 
-    Going back from the cell, the fingers come down at the first place that is free for them.
-    """
-    theta = 2 * math.pi * rotation / ROTATIONS
-    direction = np.array([math.sin(theta), math.cos(theta)])  # rows run along y, columns along x
+
+def line_from(
+    height_m: npt.NDArray[np.float32],
+    start: tuple[int, int],
+    rotation: int,
+    push_m: float,
+    resolution_m: float,
+) -> PushLine | None:
+    """The push from a start on; None where it meets nothing."""
     length = round(push_m / resolution_m)
-    back = np.arange(length - round(_FOLLOW_M / resolution_m) + 1)
-    rows, cols = np.rint(np.array(cell)[:, None] - direction[:, None] * back).astype(np.intp)
-    outside = np.flatnonzero((rows < 0) | (rows >= free.shape[0]) | (cols < 0) | (cols >= free.shape[1]))
-    if len(outside):
-        rows, cols = rows[: outside[0]], cols[: outside[0]]
-    starts = np.flatnonzero(free[rows, cols])
-    if not len(starts):
-        return None
-    start = np.array([rows[starts[0]], cols[starts[0]]])
-    way = np.rint(start[:, None] + direction[:, None] * np.arange(length + 1)).astype(np.intp)
-    outside = np.flatnonzero(((way < 0) | (way >= np.array(free.shape)[:, None])).any(axis=0))
+    way = np.rint(np.array(start)[:, None] + _direction(rotation)[:, None] * np.arange(length + 1)).astype(np.intp)
+    outside = np.flatnonzero(((way < 0) | (way >= np.array(height_m.shape)[:, None])).any(axis=0))
     cells = way.T[: outside[0]] if len(outside) else way.T
     profile = np.nan_to_num(height_m[cells[:, 0], cells[:, 1]], nan=0.0)
     met = np.flatnonzero(profile > MIN_OBJECT_M)
     if not len(met):
         return None
     face = profile[met[0] : met[0] + round(_FACE_M / resolution_m)]
-    return PushLine(int(start[0]), int(start[1]), float(face.max()), cells)
+    return PushLine(start[0], start[1], float(face.max()), cells)
+
+
+def _direction(rotation: int) -> Array:
+    """Steps in rows, which run along y, and in columns, which run along x."""
+    theta = 2 * math.pi * rotation / ROTATIONS
+    return np.array([math.sin(theta), math.cos(theta)])

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.push_line import PushLine, push_line
+from policy.push_line import PushLine, line_from, push_starts
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ _DILATIONS = 15
 _PER_ROTATION = 4
 _PUSH_TRIES = 400
 _APART = 3
+_STARTS_APART = 8
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
 # network, and at an edge the fingers slip. Standard deviation in cells.
 _SMOOTH_CELLS = 1.5
@@ -62,18 +63,25 @@ def faded(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_]) -> npt.NDArra
     return np.stack([cv2.GaussianBlur(plane, (0, 0), _SMOOTH_CELLS) for plane in inside])
 
 
-def best_cells(
-    q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], count: int
-) -> Iterator[tuple[int, int, int, float]]:
-    """(rotation, row, col, Q) of the `count` largest values inside a mask (H, W) or (K, H, W), the largest first."""
+class Cells(NamedTuple):
+    """Places of Q maps and their values, each (N,)."""
+
+    rotation: npt.NDArray[np.intp]
+    row: npt.NDArray[np.intp]
+    col: npt.NDArray[np.intp]
+    q: npt.NDArray[np.float32]
+
+
+def best_cells(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], count: int) -> Cells:
+    """The `count` largest values of Q maps (K, H, W) inside a mask (H, W) or (K, H, W), the largest first."""
     inside = np.flatnonzero(np.broadcast_to(mask, q.shape))
     values = q.ravel()[inside]
     if len(values) > count:
         largest = np.argpartition(values, -count)[-count:]
         inside, values = inside[largest], values[largest]
-    for i in np.argsort(-values, kind="stable"):
-        k, row, col = np.unravel_index(inside[i], q.shape)
-        yield int(k), int(row), int(col), float(values[i])
+    order = np.argsort(-values, kind="stable")
+    rotation, row, col = np.unravel_index(inside[order], q.shape)
+    return Cells(rotation, row, col, values[order])
 
 
 class Candidate(NamedTuple):
@@ -102,12 +110,17 @@ def pushes(
     cells = mask & lattice if (mask & lattice).any() else mask
     for k in range(len(q)):
         places = set()
-        for _, row, col, value in best_cells(q[k : k + 1], cells, _PUSH_TRIES):
-            line = push_line(height_m, free, (row, col), k, push_m, resolution_m)
-            if line is None or (place := (line.row // _APART, line.col // _APART)) in places:
+        best = best_cells(q[k : k + 1], cells, _PUSH_TRIES)
+        starts = push_starts(free, np.column_stack([best.row, best.col]), k, push_m, resolution_m)
+        for i in np.flatnonzero(starts[:, 0] >= 0):
+            row, col = int(starts[i, 0]), int(starts[i, 1])
+            if (near := (row // _STARTS_APART, col // _STARTS_APART)) in places:
                 continue
-            yield Candidate(k, (row, col), value, line)
-            places.add(place)
+            line = line_from(height_m, (row, col), k, push_m, resolution_m)
+            if line is None:
+                continue
+            yield Candidate(k, (int(best.row[i]), int(best.col[i])), float(best.q[i]), line)
+            places.add(near)
             if len(places) == _PER_ROTATION:
                 break
 

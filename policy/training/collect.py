@@ -258,9 +258,9 @@ def _best_grasp(
     q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], among: int, rng: np.random.Generator
 ) -> _Choice:
     """One of so many of the best."""
-    best = list(best_cells(faded(q, mask), mask, among))
-    k, row, col, _ = best[int(rng.integers(len(best)))]
-    return _Choice(GRASP, k, (row, col), greedy=among == 1)
+    best = best_cells(faded(q, mask), mask, among)
+    i = int(rng.integers(len(best.q)))
+    return _Choice(GRASP, int(best.rotation[i]), (int(best.row[i]), int(best.col[i])), greedy=among == 1)
 
 
 def _best_push(
@@ -268,9 +268,10 @@ def _best_push(
 ) -> Iterator[_Choice]:
     """One of the best pushes, after the best cell if that has no place to begin: the network is to learn that too."""
     greedy = rng.random() < _GREEDY_SHARE
-    best = list(best_cells(q, mask, _AMONG_BEST))
-    for n, i in enumerate(range(len(best)) if greedy else rng.permutation(len(best))):
-        k, row, col, _ = best[i]
+    best = best_cells(q, mask, _AMONG_BEST)
+    count = len(best.q)
+    for n, i in enumerate(range(count) if greedy else rng.permutation(count)):
+        k, row, col = int(best.rotation[i]), int(best.row[i]), int(best.col[i])
         possible = _has_start(state, (row, col), k, config)
         if possible or n == 0:
             yield _Choice(PUSH, k, (row, col), greedy)

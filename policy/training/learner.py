@@ -174,7 +174,8 @@ class Learner:
             q = self.online(x)[:, GRASP].float().cpu().numpy()
         maps = np.zeros((GRASP_ROTATIONS, *cells.shape), np.float32)
         maps[:, copies.rows, copies.cols] = copies.values(q)
-        rotation, row, col, _ = next(best_cells(faded(maps, cells), cells, 1))
+        best = best_cells(faded(maps, cells), cells, 1)
+        rotation, row, col = int(best.rotation[0]), int(best.row[0]), int(best.col[0])
         chosen = crop(view, GRASP, (row, col), rotation, None)[None]
         return float(self._at_middle(self.target, chosen, np.array([GRASP]))[0])
 

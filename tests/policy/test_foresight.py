@@ -34,6 +34,10 @@ class Table:
         return foresight, line, foresight.play(line, rotation)
 
 
+def freed(foresight, label, played):
+    return foresight.freed(label, foresight.around(label, played))
+
+
 def shift(played, label, cell):
     """How far the middle of an object goes [m], along x and y."""
     before = (np.array(cell[::-1]) + 0.5) * RESOLUTION_M
@@ -75,22 +79,33 @@ def test_fingers_pass_over_what_is_lower_than_their_tips():
     table = Table((100, 60, 25, 25, 0.10), (100, 95, 25, 25, 0.03))
     foresight, _, played = table.push((112, 72), 0)
     assert set(played.moves) == {1}
-    assert foresight.freed(1, played) < 0.1  # it stands over the low one now
+    assert freed(foresight, 1, played) < 0.1  # it stands over the low one now
+
+
+def test_what_stands_in_the_mouth_of_another_is_not_driven_out():
+    table = Table((100, 60, 20, 20), (90, 100, 40, 40), (86, 106, 18, 18))
+    # The second is open towards smaller rows, and the third stands in it.
+    table.labels[90:114, 103:127] = table.height_m[90:114, 103:127] = 0
+    table.labels[86:104, 106:124], table.height_m[86:104, 106:124] = 3, 0.05
+    _, _, away = table.push((110, 70), 8)
+    assert set(away.moves) == {1}
+    _, _, out = table.push((125, 115), 12)
+    assert set(out.moves) == {2, 3}
+    assert shift(out, 2, (110, 120))[1] < shift(out, 3, (95, 115))[1] < -0.02
 
 
 def test_a_push_away_from_a_neighbour_frees_the_border():
     table = Table((100, 100, 25, 25), (100, 126, 25, 25))
     foresight, _, away = table.push((112, 112), 4)
-    assert foresight.freed(1, away) > 0.15
-    assert foresight.freed(2, away) > 0.15
+    assert freed(foresight, 1, away) > 0.15
+    assert freed(foresight, 2, away) > 0.15
     _, _, together = table.push((112, 112), 0)
-    assert foresight.freed(1, together) == pytest.approx(0, abs=0.05)
+    assert freed(foresight, 1, together) == pytest.approx(0, abs=0.05)
 
 
 def test_an_object_without_neighbours_has_nothing_to_be_freed_of():
     foresight, _, played = Table((100, 100, 25, 25)).push((112, 112), 3)
-    assert foresight.freed(1, played) == 0.0
-    assert foresight.freed(7, played) == 0.0
+    assert freed(foresight, 1, played) == 0.0
 
 
 def test_what_ends_at_the_rim_may_be_lost():

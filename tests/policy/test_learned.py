@@ -129,6 +129,18 @@ def test_what_may_not_be_grasped_is_pushed(network, observation):
         decide(network, replace(observation, may_grasp=False), may_push=False)
 
 
+def test_where_no_push_begins_near_the_goal_one_farther_out_is_taken(network):
+    heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
+    heights[35:190, 35:190], labels[35:190, 35:190] = 0.05, 2
+    labels[GOAL] = 1
+    heap = Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+    put(network.grasp, 5, 110, 115, 0.02)
+    network.push[0, 108:116, 55:63] = 0.9
+    action = decide(network, heap)
+    assert action.primitive is Primitive.PUSH
+    assert not heights[action.row, action.col]
+
+
 def test_a_likely_grasp_is_not_delayed(network, observation):
     put(network.grasp, 5, 110, 115, 0.9)
     network.push[0, 112, 112] = 1.0
@@ -146,9 +158,9 @@ def test_a_failed_action_is_not_repeated(network, observation):
 
 def test_fingers_that_would_land_on_a_neighbour_are_no_grasp(network, observation):
     put(network.grasp, 0, 112, 112, 1.0)  # the right finger comes down on the other block
-    put(network.grasp, 4, 112, 112, 0.5)
+    put(network.grasp, 4, 112, 112, 0.7)
     action = decide(network, replace(observation, may_push=False))
-    assert (action.rotation, action.q_value) == (4, pytest.approx(0.5, abs=0.05))
+    assert (action.rotation, action.q_value) == (4, pytest.approx(0.7, abs=0.05))
 
 
 def test_a_lone_peak_is_no_grasp(network, observation):

@@ -47,7 +47,7 @@ def test_maps_that_say_nothing_inside_the_mask_are_refused():
     count=st.integers(1, 40),
 )
 def test_the_best_cells_are_the_largest_values_inside_the_mask(q, mask, count):
-    found = list(best_cells(q, mask, count))
+    found = list(zip(*best_cells(q, mask, count), strict=True))
     values = np.sort(q[:, mask].ravel())[::-1][:count]
     assert [value for *_, value in found] == values.tolist()
     for k, row, col, value in found:
@@ -60,7 +60,7 @@ def test_a_mask_may_differ_from_rotation_to_rotation():
     q = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
     mask = np.zeros((2, 2, 2), np.bool_)
     mask[0, 1, 0] = True
-    assert list(best_cells(q, mask, 3)) == [(0, 1, 0, 2.0)]
+    assert list(zip(*best_cells(q, mask, 3), strict=True)) == [(0, 1, 0, 2.0)]
 
 
 def test_pushes_concern_the_target_and_what_stands_within_30_mm_of_it():

@@ -1,0 +1,90 @@
+"""What a push is good for: how well its object can be grasped once the push has made room around it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from policy.encoding import encode
+from policy.grasping import Jaw, Table, finger_room
+from policy.network import GRASP
+from policy.selection import Cells, best_cells, check_maps, faded
+
+if TYPE_CHECKING:
+    from policy.foresight import Foresight
+    from policy.inference import Inference
+
+# Of an object that stood alone, so many grasps are looked at, on cells so far apart; the best of those that have room
+# after a push count. One grasp may find room by an error of the played push, so many do not.
+_GRASPS = 80
+_APART = 2
+_COUNTED = 20
+
+
+class Prospects:
+    """The grasps of the objects of one view, after pushes.
+
+    Args:
+        inference: the network.
+        foresight: of the view.
+        labels: (H, W) the object in each cell, 0 for none.
+        height_m: (H, W) with closed gaps, NaN where nothing was seen.
+        color: (H, W, 3) uint8 RGB.
+        jaw: of the gripper.
+        resolution_m: size of a cell.
+    """
+
+    def __init__(
+        self,
+        inference: Inference,
+        foresight: Foresight,
+        labels: npt.NDArray[np.integer],
+        height_m: npt.NDArray[np.float32],
+        color: npt.NDArray[np.uint8],
+        jaw: Jaw,
+        resolution_m: float,
+    ) -> None:
+        self._inference = inference
+        self._foresight = foresight
+        self._labels = labels
+        self._height_m = height_m
+        self._color = color
+        self._jaw = jaw
+        self._resolution_m = resolution_m
+        self._grasps: dict[int, Cells] = {}
+
+    def after(self, label: int, around: npt.NDArray[np.float32]) -> float:
+        """About the chance that an object can be grasped after a push.
+
+        The mean of the best grasps' Q, as if nothing stood around the object, times the room that the fingers find.
+
+        Args:
+            label: of the object.
+            around: what the push makes of its window (`Foresight.around`).
+        """
+        grasps = self._alone(label)
+        own = self._foresight.window(label).own
+        top = np.asarray(cv2.medianBlur(np.where(own, around, np.float32(0)), 5), np.float32)
+        table = Table(around, around, top, own.astype(np.int32), pad=0, resolution_m=self._resolution_m)
+        room = finger_room(table, grasps.row, grasps.col, grasps.rotation, self._jaw)
+        return float(np.sort(grasps.q * room)[-_COUNTED:].mean())
+
+    def _alone(self, label: int) -> Cells:
+        """The best grasps of an object if all others were gone; cells of its window."""
+        if label not in self._grasps:
+            own = self._labels == label
+            bare = np.where(own, np.nan_to_num(self._height_m), np.float32(0))
+            table = self._labels == 0
+            color = np.median(self._color[table], axis=0) if table.any() else np.zeros(3)
+            planes = encode(bare, np.where(own[..., None], self._color, color.astype(np.uint8)))
+            q = self._inference.maps(planes, own, GRASP)
+            check_maps(q, own, "grasp")
+            lattice = np.zeros_like(own)
+            lattice[::_APART, ::_APART] = True
+            cells = own & lattice if (own & lattice).any() else own
+            best, window = best_cells(faded(q, own), cells, _GRASPS), self._foresight.window(label)
+            self._grasps[label] = best._replace(row=best.row - window.top, col=best.col - window.left)
+        return self._grasps[label]
