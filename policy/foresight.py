@@ -20,6 +20,7 @@ from scipy.ndimage import find_objects
 from policy.border import border_cells, stands
 from robotcell import linkage
 from robotcell.decision import ROTATIONS
+from robotcell.perception import MIN_OBJECT_M
 
 if TYPE_CHECKING:
     from policy.push_line import PushLine
@@ -165,20 +166,16 @@ class Foresight:
         """(h, w) heights in the window of an object after a push; the window goes and turns with the object."""
         window = self.window(label)
         here = played.moves.get(label, _STAYS)
-        rest = self._height_m.copy()
-        for gone in {*played.moves, label}:
-            box, cells = self._cells[gone]
-            rest[box][cells] = 0.0
-        heights = self._seen(rest, (0, 0), window, here)
-        for other, move in played.moves.items():
-            if other != label:
-                (rows, cols), cells = self._cells[other]
-                alone = np.where(cells, self._height_m[rows, cols], np.float32(0))
-                seen = self._seen(alone, (rows.start, cols.start), window, _then(here, _inverse(move)))
-                np.maximum(heights, seen, out=heights)
+        others = {other: move for other, move in played.moves.items() if other != label}
+        heights = self._after((window.top, window.left), window.own.shape, here, others, {*others, label})
         box, cells = self._cells[label]
         heights[window.own] = self._height_m[box][cells]
         return heights
+
+    def uncovered(self, cells: npt.NDArray[np.bool_], played: Played) -> float:
+        """Share of cells (H, W) on which nothing stands any more after a push."""
+        heights = self._after((0, 0), cells.shape, _STAYS, played.moves, set(played.moves))
+        return float((heights[cells] < MIN_OBJECT_M).mean())
 
     def freed(self, label: int, around: npt.NDArray[np.float32]) -> float:
         """How much of an object's border a push frees: the fall in the share that others stand on (paper, stage II).
@@ -195,23 +192,49 @@ class Foresight:
         rows, cols = self.window(label).border.T
         return float(stands(around[rows, cols]).mean())
 
-    def _seen(
-        self, height_m: npt.NDArray[np.float32], corner: tuple[int, int], window: Window, move: Array
+    def _after(
+        self,
+        corner: tuple[int, int],
+        size: tuple[int, ...],
+        here: Array,
+        moves: dict[int, Array],
+        gone: set[int],
     ) -> npt.NDArray[np.float32]:
-        """Heights as the window shows them.
+        """(h, w) heights after a push in a window of the map.
 
         Args:
-            height_m: a part of the map.
-            corner: row and column of its first cell.
-            window: of an object.
-            move: (2, 3) from x and y [m] in the window to those of the part.
+            corner: row and column of the map at its first cell.
+            size: its rows and columns.
+            here: (2, 3) the window's own move.
+            moves: of the objects that are shown where they came to.
+            gone: labels of those that are not shown where they were.
         """
+        rest = self._height_m.copy()
+        for label in gone:
+            box, cells = self._cells[label]
+            rest[box][cells] = 0.0
+        heights = self._warped(rest, (0, 0), here, corner, size)
+        for label, move in moves.items():
+            (rows, cols), cells = self._cells[label]
+            alone = np.where(cells, self._height_m[rows, cols], np.float32(0))
+            way = _then(here, _inverse(move))
+            np.maximum(heights, self._warped(alone, (rows.start, cols.start), way, corner, size), out=heights)
+        return heights
+
+    def _warped(
+        self,
+        height_m: npt.NDArray[np.float32],
+        start: tuple[int, int],
+        move: Array,
+        corner: tuple[int, int],
+        size: tuple[int, ...],
+    ) -> npt.NDArray[np.float32]:
+        """A part of the map, its first cell at `start`, as a window shows it; `move` from the window to the part."""
         turn = move[:, :2]
-        half = np.array([window.left + 0.5, window.top + 0.5])
-        shift = turn @ half + move[:, 2] / self._resolution_m - 0.5 - np.array(corner[::-1])
+        half = np.array(corner[::-1]) + 0.5
+        shift = turn @ half + move[:, 2] / self._resolution_m - 0.5 - np.array(start[::-1])
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        size = window.own.shape[::-1]
-        return np.asarray(cv2.warpAffine(height_m, np.column_stack([turn, shift]), size, flags=flags), np.float32)
+        return np.asarray(cv2.warpAffine(height_m, np.column_stack([turn, shift]), size[::-1], flags=flags), np.float32)
 
     def _prism(self, label: int) -> _Prism | None:
         (rows, cols), own = self._cells[label]

@@ -50,7 +50,10 @@ _USEFUL_GAIN = 0.1
 
 
 class _Push(NamedTuple):
-    """A push that was played ahead: what it frees of its object's border, what it promises, and a loss."""
+    """A push that was played ahead: what it frees of its object's border, what it promises, and whether one is lost.
+
+    What hides a goal is not to be grasped: there, the promise is the share of its cells that the push uncovers.
+    """
 
     candidate: Candidate
     gain: float
@@ -168,8 +171,11 @@ class LearnedPolicy:
                 played = foresight.play(push.line, push.rotation)
                 # Without a goal, whatever the push goes through is what it is to free.
                 label = int(observation.labels[push.cell]) if goal is None else goal
-                around = foresight.around(label, played)
-                gain, promise = foresight.freed(label, around), prospects.after(label, around)
+                if observation.may_grasp:
+                    around = foresight.around(label, played)
+                    gain, promise = foresight.freed(label, around), prospects.after(label, around)
+                else:
+                    gain, promise = 0.0, foresight.uncovered(targets, played)
                 found.append(_Push(push, gain, promise, played.lost))
             if found:
                 return max(found, key=_Push.worth)

@@ -282,11 +282,13 @@ class _Job:
                 place = observation.goal
             view, outcome = self._act(goal, view, action)
             place = None if place is None else _whereabouts(place, action, outcome, self.cell.config)
-            pushes = pushes + 1 if action.primitive is Primitive.PUSH else 0
-            # A push that moved something is no failure, but only a pick is what the attempts are for.
+            if observation.may_grasp:
+                pushes = pushes + 1 if action.primitive is Primitive.PUSH else 0
+            # A push that moved something is no failure, but only a pick is what the attempts are for; while the goal
+            # is hidden, nothing else than failures ends the search.
             if outcome.result is Result.PICKED:
                 failures = 0
-            elif not outcome.success:
+            elif not outcome.success or not observation.may_grasp:
                 failures += 1
             barred = () if outcome.result in _SCENE_CHANGED else (*barred, action)
             if outcome.result is Result.PICKED and goal is not None:
@@ -437,7 +439,7 @@ def _observe(
     try:
         goal_mask = labels == find_goal(view.segmentation, goal).label
     except NoTarget:
-        if place is None or not may_push:
+        if place is None:
             raise
         return _uncover(view, place, barred)
     return Observation(view.heightmap, labels, goal_mask, barred, may_push)

@@ -108,6 +108,19 @@ def test_an_object_without_neighbours_has_nothing_to_be_freed_of():
     assert freed(foresight, 1, played) == 0.0
 
 
+def test_cells_are_uncovered_by_what_leaves_them():
+    table = Table((100, 60, 25, 25), (100, 90, 25, 25))
+    first, second = table.labels == 1, table.labels == 2
+    foresight, _, played = table.push((112, 72), 4)
+    assert set(played.moves) == {1}
+    assert foresight.uncovered(first, played) > 0.9
+    assert foresight.uncovered(second, played) == 0.0
+    # The first comes to stand where the second stood.
+    foresight, _, along = table.push((112, 72), 0)
+    assert foresight.uncovered(first, along) > 0.9
+    assert 0.1 < foresight.uncovered(second, along) < 0.9
+
+
 def test_what_ends_at_the_rim_may_be_lost():
     assert Table((100, 180, 25, 25)).push((112, 192), 0)[2].lost
     assert not Table((100, 180, 25, 25)).push((112, 192), 8)[2].lost

@@ -205,6 +205,16 @@ def test_what_hides_a_goal_is_pushed_aside_and_never_picked(
         assert observation.goal[observation.heightmap.workspace.cell(*RED)]
 
 
+def test_a_hidden_goal_is_searched_for_by_ten_pushes(config: CellConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    hide_goal(monkeypatch, set(range(1, 50)))
+    monkeypatch.setattr(jobs, "judge", lambda *_: Outcome(Result.PUSHED, None, "it moved", 0.0))
+    policy = Scripted([push_at(-0.6, -0.15)] * 20)
+    report, results, _ = run(config, policy, ("red",))
+    assert [observation.may_grasp for observation in policy.seen] == [True] + [False] * 10
+    assert all(observation.may_push for observation in policy.seen)
+    assert "10 failed attempts in a row" in report.reason
+
+
 def test_a_hidden_goal_is_looked_for_where_a_push_may_have_taken_it(
     config: CellConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
