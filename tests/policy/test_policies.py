@@ -25,5 +25,7 @@ def test_every_policy_comes_with_what_it_needs(name):
 
 
 def test_an_unknown_policy_lists_those_that_exist():
-    with pytest.raises(ConfigError, match="no policy is called 'best'; there is: grasp-only, heuristic, learned, random"):
+    with pytest.raises(
+        ConfigError, match="no policy is called 'best'; there is: grasp-only, heuristic, learned, random"
+    ):
         make_policy("best", CONFIG)

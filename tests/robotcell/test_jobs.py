@@ -209,7 +209,7 @@ def test_a_hidden_goal_is_searched_for_by_ten_pushes(config: CellConfig, monkeyp
     hide_goal(monkeypatch, set(range(1, 50)))
     monkeypatch.setattr(jobs, "judge", lambda *_: Outcome(Result.PUSHED, None, "it moved", 0.0))
     policy = Scripted([push_at(-0.6, -0.15)] * 20)
-    report, results, _ = run(config, policy, ("red",))
+    report, _, _ = run(config, policy, ("red",))
     assert [observation.may_grasp for observation in policy.seen] == [True] + [False] * 10
     assert all(observation.may_push for observation in policy.seen)
     assert "10 failed attempts in a row" in report.reason
