@@ -117,11 +117,11 @@ class Foresight:
     """
 
     def __init__(self, labels: npt.NDArray[np.integer], height_m: npt.NDArray[np.float32], resolution_m: float) -> None:
-        self._labels = labels
         self._height_m = np.nan_to_num(height_m, nan=0.0)
         self._resolution_m = resolution_m
         boxes = find_objects(labels)
         self._cells = {i: (box, labels[box] == i) for i, box in enumerate(boxes, start=1) if box is not None}
+        self._alone = {i: np.where(own, self._height_m[box], np.float32(0)) for i, (box, own) in self._cells.items()}
         self._prisms = {i: prism for i in self._cells if (prism := self._prism(i)) is not None}
         self._windows: dict[int, Window] = {}
         self._occupied: dict[int, float] = {}
@@ -215,10 +215,10 @@ class Foresight:
             rest[box][cells] = 0.0
         heights = self._warped(rest, (0, 0), here, corner, size)
         for label, move in moves.items():
-            (rows, cols), cells = self._cells[label]
-            alone = np.where(cells, self._height_m[rows, cols], np.float32(0))
+            (rows, cols), _ = self._cells[label]
             way = _then(here, _inverse(move))
-            np.maximum(heights, self._warped(alone, (rows.start, cols.start), way, corner, size), out=heights)
+            shown = self._warped(self._alone[label], (rows.start, cols.start), way, corner, size)
+            np.maximum(heights, shown, out=heights)
         return heights
 
     def _warped(
@@ -263,7 +263,7 @@ class Foresight:
 
     def _margin(self, outline: Array) -> float:
         """Distance [m] from the rim of the map, negative beyond it."""
-        size = np.array(self._labels.shape[::-1]) * self._resolution_m
+        size = np.array(self._height_m.shape[::-1]) * self._resolution_m
         return float(min(outline.min(), (size - outline).min()))
 
 

@@ -35,7 +35,7 @@ _PUSH_REACHES = 3
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
 # So many of the best grasps are looked at for whether the fingers come down beside what stands around. The network
-# has seen that as well: of powers of their room, no less than the one, the other told grasps apart best (measured).
+# has seen that as well: of powers of their room, no less than the one, the other told labelled grasps apart best.
 _LOOKED_AT = 400
 _BLOCKED = 0.05
 _ROOM_POWER = 0.2

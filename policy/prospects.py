@@ -11,7 +11,7 @@ import numpy.typing as npt
 from policy.encoding import encode
 from policy.grasping import Jaw, Table, finger_room
 from policy.network import GRASP
-from policy.selection import Cells, best_cells, check_maps, faded
+from policy.selection import Cells, best_cells, check_maps, faded, thinned
 
 if TYPE_CHECKING:
     from policy.foresight import Foresight
@@ -82,9 +82,7 @@ class Prospects:
             planes = encode(bare, np.where(own[..., None], self._color, color.astype(np.uint8)))
             q = self._inference.maps(planes, own, GRASP)
             check_maps(q, own, "grasp")
-            lattice = np.zeros_like(own)
-            lattice[::_APART, ::_APART] = True
-            cells = own & lattice if (own & lattice).any() else own
-            best, window = best_cells(faded(q, own), cells, _GRASPS), self._foresight.window(label)
+            best = best_cells(faded(q, own), thinned(own, _APART), _GRASPS)
+            window = self._foresight.window(label)
             self._grasps[label] = best._replace(row=best.row - window.top, col=best.col - window.left)
         return self._grasps[label]

@@ -84,6 +84,13 @@ def best_cells(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], count: i
     return Cells(rotation, row, col, values[order])
 
 
+def thinned(mask: npt.NDArray[np.bool_], apart: int) -> npt.NDArray[np.bool_]:
+    """Every so many-th row and column of a mask (H, W); all of it where none of these is in it."""
+    lattice = np.zeros_like(mask)
+    lattice[::apart, ::apart] = mask[::apart, ::apart]
+    return lattice if lattice.any() else mask
+
+
 class Candidate(NamedTuple):
     """A push that may be chosen: rotation, cell of the push map, its Q, and the way of the fingers."""
 
@@ -105,9 +112,7 @@ def pushes(
 
     Of those that begin side by side only the first.
     """
-    lattice = np.zeros_like(mask)
-    lattice[::_APART, ::_APART] = True
-    cells = mask & lattice if (mask & lattice).any() else mask
+    cells = thinned(mask, _APART)
     for k in range(len(q)):
         places = set()
         best = best_cells(q[k : k + 1], cells, _PUSH_TRIES)

@@ -129,7 +129,8 @@ def main() -> None:
     for low in np.arange(0.0, 1.0, 0.1):
         at = (value >= low) & (value < low + 0.1 if low < 0.85 else True)
         if at.any():
-            sys.stdout.write(f"grasps worth {low:.1f} and more: {at.sum()}, {100 * held[at].mean():.0f} % succeed\n")
+            upper = f"to {low + 0.1:.1f}" if low < 0.85 else "and more"
+            sys.stdout.write(f"grasps worth {low:.1f} {upper}: {at.sum()}, {100 * held[at].mean():.0f} % succeed\n")
 
 
 if __name__ == "__main__":
