@@ -1,24 +1,18 @@
-"""What a push would do, played ahead on the plane of the table: objects as prisms that slide, turn and touch.
-
-The physics is Chipmunk's (pymunk), seen from above, with the table's friction added as Coulomb's. It knows nothing of
-toppling and stacks.
-"""
+"""What a push would do, played ahead: where the objects would come to stand, and what would be seen around them."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pymunk
 from scipy.ndimage import find_objects
 
 from policy.border import border_cells, stands
-from robotcell import linkage
+from policy.sliding import Prism, SlidingTable
 from robotcell.decision import ROTATIONS
 from robotcell.perception import MIN_OBJECT_M
 
@@ -26,54 +20,14 @@ if TYPE_CHECKING:
     from policy.push_line import PushLine
     from robotcell.geometry import Array
 
-_GRAVITY_M_S2 = 9.81
-# Wood on a mat, on wood and on rubber; about the middle of what training draws.
-_TABLE_FRICTION = 0.6
-_OBJECT_FRICTION = 0.6
-_FINGER_FRICTION = 0.8
-# Share of the radius at which friction acts against turning: two thirds for a disc that only turns, less for what
-# slides as well. Set by comparing plays with the twin.
-_LEVER = 0.3
-# Twice as fast as the arm: friction of the table makes the outcome depend on the way alone.
-_SPEED_M_S = 0.16
-_STEP_S = 1 / 120
-# Outlines overlap by noise: so much is left alone, and a tenth of what is more goes in every step.
-_OVERLAP_M = 0.0006
-_LEFT_OVERLAP = 0.9**120
-# An outline that fills less of its hull is concave, and halved until its pieces are not, or too small to matter.
-_CONVEX = 0.82
-_LEAST_PART_CELLS = 9
-# An object of fewer cells is noise.
-_LEAST_CELLS = 12
 # What is pushed nearer to the rim of the map than this, and not just along it, may leave it or leaves no room for a
 # finger.
 _RIM_M = 0.03
 # The window of an object shows so much around it: farther than fingers that grasp it reach, and than its border.
 _AROUND_M = 0.07
-_STAYS = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_STAYS = np.eye(3)
 # The fingers pass over what is lower than their tips, with so much to spare.
 _CLEAR_M = 0.002
-
-
-@dataclass(frozen=True)
-class _Prism:
-    """An object: convex `parts`, each (N, 2) x and y in metres from the map's corner, their middle, and its height."""
-
-    parts: tuple[Array, ...]
-    center: Array
-    height_m: float
-
-    @cached_property
-    def outline(self) -> Array:
-        return np.concatenate(self.parts)
-
-    @cached_property
-    def areas(self) -> tuple[float, ...]:
-        return tuple(float(cv2.contourArea(part.astype(np.float32))) for part in self.parts)
-
-    @cached_property
-    def radius(self) -> float:
-        return math.sqrt(sum(self.areas) / math.pi)
 
 
 @dataclass(frozen=True)
@@ -81,7 +35,7 @@ class Played:
     """What came of a push.
 
     Attributes:
-        moves: (2, 3) by label of each object that moved: the map's x and y [m] before to those after.
+        moves: by label of each object that moved, see `policy.sliding.SlidingTable.push`.
         lost: whether one of them came so near to the rim of the workspace that it may leave it.
     """
 
@@ -123,35 +77,17 @@ class Foresight:
         self._cells = {i: (box, labels[box] == i) for i, box in enumerate(boxes, start=1) if box is not None}
         self._alone = {i: np.where(own, self._height_m[box], np.float32(0)) for i, (box, own) in self._cells.items()}
         self._prisms = {i: prism for i in self._cells if (prism := self._prism(i)) is not None}
+        self._table = SlidingTable(self._prisms)
         self._windows: dict[int, Window] = {}
         self._occupied: dict[int, float] = {}
 
     def play(self, line: PushLine, rotation: int) -> Played:
         """Move the closed fingers along a push."""
-        resolution = self._resolution_m
-        theta = 2 * math.pi * rotation / ROTATIONS
-        along = np.array([math.cos(theta), math.sin(theta)])
-        length = (len(line.cells) - 1) * resolution
-        start = (np.array([line.col, line.row]) + 0.5) * resolution
-        space = pymunk.Space()
-        space.collision_slop, space.collision_bias = _OVERLAP_M, _LEFT_OVERLAP
-        bodies = {}
-        for label, prism in self._prisms.items():
-            ahead = (prism.center - start) @ along
-            aside = abs((prism.center - start) @ (-along[1], along[0]))
-            reached = -0.1 < ahead < 2 * length + 0.1 and aside < length
-            # The paper pushes at half of the height of what is met.
-            if reached and prism.height_m > line.top_m / 2 + _CLEAR_M:
-                bodies[label] = _add(space, prism)
-        fingers = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        fingers.position, fingers.angle = (float(start[0]), float(start[1])), theta
-        fingers.velocity = (float(_SPEED_M_S * along[0]), float(_SPEED_M_S * along[1]))
-        box = pymunk.Poly.create_box(fingers, (2 * linkage.FINGER_THICKNESS_M, linkage.FINGER_BREADTH_M))
-        box.friction = _FINGER_FRICTION
-        space.add(fingers, box)
-        for _ in range(round(length / _SPEED_M_S / _STEP_S)):
-            space.step(_STEP_S)
-        return self._outcome(bodies)
+        start = (np.array([line.col, line.row]) + 0.5) * self._resolution_m
+        length_m = (len(line.cells) - 1) * self._resolution_m
+        # The paper pushes at half of the height of what is met.
+        moves = self._table.push(start, 2 * math.pi * rotation / ROTATIONS, length_m, line.top_m / 2 + _CLEAR_M)
+        return Played(moves, any(self._may_be_lost(self._prisms[i], move) for i, move in moves.items()))
 
     def window(self, label: int) -> Window:
         """What is seen of an object and of what stands around it."""
@@ -161,6 +97,14 @@ class Foresight:
             border = border_cells(np.pad(own, pad))
             self._windows[label] = Window(rows.start - pad, cols.start - pad, np.pad(own, pad), border)
         return self._windows[label]
+
+    def alone(self, label: int) -> npt.NDArray[np.float32]:
+        """(h, w) heights in the window of an object if there were no other."""
+        window = self.window(label)
+        heights = np.zeros(window.own.shape, np.float32)
+        box, cells = self._cells[label]
+        heights[window.own] = self._height_m[box][cells]
+        return heights
 
     def around(self, label: int, played: Played) -> npt.NDArray[np.float32]:
         """(h, w) heights in the window of an object after a push; the window goes and turns with the object."""
@@ -205,7 +149,7 @@ class Foresight:
         Args:
             corner: row and column of the map at its first cell.
             size: its rows and columns.
-            here: (2, 3) the window's own move.
+            here: the window's own move.
             moves: of the objects that are shown where they came to.
             gone: labels of those that are not shown where they were.
         """
@@ -214,106 +158,59 @@ class Foresight:
             box, cells = self._cells[label]
             rest[box][cells] = 0.0
         heights = self._warped(rest, (0, 0), here, corner, size)
+        back = _inverse(here)
         for label, move in moves.items():
-            (rows, cols), _ = self._cells[label]
-            way = _then(here, _inverse(move))
-            shown = self._warped(self._alone[label], (rows.start, cols.start), way, corner, size)
-            np.maximum(heights, shown, out=heights)
+            prism = self._prisms[label]
+            way = back @ move
+            # Only the part of the window that it may come to is looked at.
+            col, row = (way[:2, :2] @ prism.center + way[:2, 2]) / self._resolution_m - corner[::-1]
+            reach = prism.reach_m / self._resolution_m + 2
+            top, left = max(0, math.floor(row - reach)), max(0, math.floor(col - reach))
+            part = heights[top : max(0, math.ceil(row + reach)), left : max(0, math.ceil(col + reach))]
+            if part.size:
+                (rows, cols), _ = self._cells[label]
+                place = (corner[0] + top, corner[1] + left)
+                shown = self._warped(self._alone[label], (rows.start, cols.start), _inverse(way), place, part.shape)
+                np.maximum(part, shown, out=part)
         return heights
 
     def _warped(
         self,
         height_m: npt.NDArray[np.float32],
         start: tuple[int, int],
-        move: Array,
+        way: Array,
         corner: tuple[int, int],
         size: tuple[int, ...],
     ) -> npt.NDArray[np.float32]:
-        """A part of the map, its first cell at `start`, as a window shows it; `move` from the window to the part."""
-        turn = move[:, :2]
-        half = np.array(corner[::-1]) + 0.5
-        shift = turn @ half + move[:, 2] / self._resolution_m - 0.5 - np.array(start[::-1])
+        """A part of the map, its first cell at `start`, as a window shows it; `way` (3, 3) from window to part."""
+        cells = way[:2].copy()
+        cells[:, 2] /= self._resolution_m
+        cells[:, 2] += cells[:, :2] @ (corner[1] + 0.5, corner[0] + 0.5)
+        cells[:, 2] -= start[1] + 0.5, start[0] + 0.5
         flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        return np.asarray(cv2.warpAffine(height_m, np.column_stack([turn, shift]), size[::-1], flags=flags), np.float32)
+        return np.asarray(cv2.warpAffine(height_m, cells, size[::-1], flags=flags), np.float32)
 
-    def _prism(self, label: int) -> _Prism | None:
-        (rows, cols), own = self._cells[label]
-        if np.count_nonzero(own) < _LEAST_CELLS:
-            return None
-        corner = np.array([cols.start, rows.start]) + 0.5
-        parts = tuple((part + corner) * self._resolution_m for part in _convex_parts(own))
-        middle = np.argwhere(own).mean(axis=0)[::-1]
-        height_m = float(np.percentile(self._height_m[rows, cols][own], 90))
-        return _Prism(parts, (middle + corner) * self._resolution_m, height_m) if parts else None
+    def _prism(self, label: int) -> Prism | None:
+        box, own = self._cells[label]
+        height_m = float(np.percentile(self._height_m[box][own], 90))
+        return Prism.of(own, (box[0].start, box[1].start), height_m, self._resolution_m)
 
-    def _outcome(self, bodies: dict[int, pymunk.Body]) -> Played:
-        moves, lost = {}, False
-        for label, body in bodies.items():
-            prism = self._prisms[label]
-            before = prism.center
-            cos, sin = math.cos(body.angle), math.sin(body.angle)
-            # The body's frame was at the middle of the outline.
-            after = np.array([body.position.x, body.position.y])
-            if np.abs(after - before).max() > self._resolution_m / 4 or abs(sin) > 0.02:
-                turn = np.array([[cos, -sin], [sin, cos]])
-                moves[label] = move = np.column_stack([turn, after - turn @ before])
-                margin = self._margin(prism.outline @ move[:, :2].T + move[:, 2])
-                lost = lost or margin < min(_RIM_M, self._margin(prism.outline) - self._resolution_m)
-        return Played(moves, lost)
+    def _may_be_lost(self, prism: Prism, move: Array) -> bool:
+        middle = move[:2, :2] @ prism.center + move[:2, 2]
+        if self._margin(middle) - prism.reach_m > _RIM_M:
+            return False
+        outline = np.concatenate(prism.parts)
+        before = self._margin(outline + prism.center)
+        return self._margin(outline @ move[:2, :2].T + middle) < min(_RIM_M, before - self._resolution_m)
 
-    def _margin(self, outline: Array) -> float:
-        """Distance [m] from the rim of the map, negative beyond it."""
+    def _margin(self, places: Array) -> float:
+        """Distance [m] of x and y (..., 2) from the rim of the map, negative beyond it."""
         size = np.array(self._height_m.shape[::-1]) * self._resolution_m
-        return float(min(outline.min(), (size - outline).min()))
-
-
-def _then(first: Array, second: Array) -> Array:
-    """Two moves (2, 3), one after the other."""
-    return np.column_stack([second[:, :2] @ first[:, :2], second[:, :2] @ first[:, 2] + second[:, 2]])
+        return float(min(places.min(), (size - places).min()))
 
 
 def _inverse(move: Array) -> Array:
-    back = move[:, :2].T
-    return np.column_stack([back, -back @ move[:, 2]])
-
-
-def _convex_parts(own: npt.NDArray[np.bool_]) -> list[Array]:
-    """Convex polygons, each (N, 2) column and row, that cover an object (h, w): its hull, or those of its halves."""
-    parts: list[Array] = []
-    contours, _ = cv2.findContours(own.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    for contour in contours:
-        hull = cv2.convexHull(contour)
-        area = cv2.contourArea(hull)
-        if area < _LEAST_PART_CELLS:
-            continue
-        if cv2.contourArea(contour) > _CONVEX * area:
-            parts.append(hull[:, 0].astype(np.float64))
-            continue
-        col, row, cols, rows = cv2.boundingRect(contour)
-        for half in range(2):
-            window = [slice(row, row + rows), slice(col, col + cols)]
-            axis, middle = (0, row + rows // 2) if rows > cols else (1, col + cols // 2)
-            window[axis] = slice(window[axis].start, middle) if half == 0 else slice(middle, window[axis].stop)
-            corner = np.array([window[1].start, window[0].start])
-            parts += [part + corner for part in _convex_parts(own[tuple(window)])]
-    return parts
-
-
-def _add(space: pymunk.Space, prism: _Prism) -> pymunk.Body:
-    parts = [[(float(x), float(y)) for x, y in part - prism.center] for part in prism.parts]
-    # The density is the same for all, and its value without meaning.
-    masses = [area * prism.height_m for area in prism.areas]
-    moment = sum(pymunk.moment_for_poly(mass, part) for mass, part in zip(masses, parts, strict=True))
-    body = pymunk.Body(sum(masses), moment)
-    body.position = (float(prism.center[0]), float(prism.center[1]))
-    shapes = [pymunk.Poly(body, part) for part in parts]
-    for shape in shapes:
-        shape.friction = _OBJECT_FRICTION
-    # Coulomb's friction of the table: joints that may slip, and pull back to no place.
-    weight = _TABLE_FRICTION * _GRAVITY_M_S2 * body.mass
-    drag = pymunk.PivotJoint(space.static_body, body, (0, 0), (0, 0))
-    drag.max_bias, drag.max_force = 0.0, weight
-    twist = pymunk.GearJoint(space.static_body, body, 0.0, 1.0)
-    twist.max_bias, twist.max_force = 0.0, _LEVER * prism.radius * weight
-    space.add(body, *shapes, drag, twist)
-    return body
+    back: Array = move.copy()
+    back[:2, :2] = move[:2, :2].T
+    back[:2, 2] = -back[:2, :2] @ move[:2, 2]
+    return back

@@ -149,13 +149,9 @@ def finger_room(
     jaw: Jaw,
 ) -> npt.NDArray[np.float32]:
     """(N,) 0..1: whether the open fingers of grasps at (N,) cells and rotations come down without touching anything."""
-    room = np.zeros(len(row), np.float32)
     center = (row + table.pad) * table.height_m.shape[1] + col + table.pad
     tip = _tcp(table, center, jaw) + np.float32(linkage.tip_retraction(jaw.opening_m))
-    for k in np.unique(rotation):
-        at = np.flatnonzero(rotation == k)
-        room[at] = _finger_room(table, center[at], tip[at], int(k), jaw.opening_m)
-    return room
+    return _finger_room(table, center, tip, rotation, jaw.opening_m)
 
 
 def _tcp(table: Table, center: npt.NDArray[np.intp], jaw: Jaw) -> npt.NDArray[np.float32]:
@@ -181,7 +177,7 @@ def _score(
     k = int(rotation[0])
     tcp = _tcp(table, center, jaw)
     tip = tcp + np.float32(linkage.tip_retraction(jaw.opening_m))
-    room = _finger_room(table, center, tip, k, jaw.opening_m)
+    room = _finger_room(table, center, tip, rotation, jaw.opening_m)
     fits = np.flatnonzero(room > 0)
     if len(fits):
         score[fits] = room[fits] * _hold(table, center[fits], tcp[fits], k, jaw.opening_m)
@@ -189,17 +185,21 @@ def _score(
 
 
 def _finger_room(
-    table: Table, center: npt.NDArray[np.intp], tip: npt.NDArray[np.float32], k: int, opening_m: float
+    table: Table,
+    center: npt.NDArray[np.intp],
+    tip: npt.NDArray[np.float32],
+    rotation: npt.NDArray[np.intp],
+    opening_m: float,
 ) -> npt.NDArray[np.float32]:
     """0..1: whether both open fingers come down beside the object without touching anything."""
     stride = table.height_m.shape[1]
-    bare = _finger_offsets(k, stride, table.resolution_m, opening_m, 0.0)
-    wide = _finger_offsets(k, stride, table.resolution_m, opening_m, _SIDE_MARGIN_M)
+    bare = _finger_offsets(stride, table.resolution_m, opening_m, 0.0)
+    wide = _finger_offsets(stride, table.resolution_m, opening_m, _SIDE_MARGIN_M)
     heights, ceilings = table.height_m.ravel(), table.ceiling_m.ravel()
-    free = tip - heights[center[:, None] + bare].max(axis=1)
+    free = tip - heights[center[:, None] + bare[rotation]].max(axis=1)
     room = np.zeros(len(center), np.float32)
     fits = np.flatnonzero(free > _TIP_MARGIN_M)
-    at = center[fits, None] + wide
+    at = center[fits, None] + wide[rotation[fits]]
     free_around = tip[fits] - heights[at].max(axis=1)
     ease = 0.5 + 0.5 * np.clip(free_around / _TIP_MARGIN_M - 1, 0, 1)
     doubtful = (ceilings[at] > tip[fits, None] - _TIP_MARGIN_M).mean(axis=1)
@@ -300,17 +300,16 @@ def _balance(
 
 
 @lru_cache(maxsize=64)
-def _finger_offsets(
-    k: int, stride: int, resolution_m: float, opening_m: float, margin_m: float
-) -> npt.NDArray[np.intp]:
-    """Flat offsets of the cells under both fingers, from the centre of the grasp."""
+def _finger_offsets(stride: int, resolution_m: float, opening_m: float, margin_m: float) -> npt.NDArray[np.intp]:
+    """(K, N) flat offsets of the cells under both fingers, from the centre of the grasp, in every direction."""
     along = (
         _spaced(linkage.FINGER_THICKNESS_M / 2 + margin_m, resolution_m)
         + opening_m / 2
         + linkage.FINGER_THICKNESS_M / 2
     )
     across = _spaced(linkage.FINGER_BREADTH_M / 2 + margin_m, resolution_m)
-    return np.unique(_flat(k, np.concatenate([along, -along]), across, stride, resolution_m))
+    both = np.concatenate([along, -along])
+    return np.stack([_flat(k, both, across, stride, resolution_m) for k in range(DIRECTIONS)])
 
 
 @lru_cache(maxsize=64)

@@ -16,7 +16,7 @@ from policy.network import GRASP, PUSH
 from policy.prospects import Prospects
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
-from policy.selection import Candidate, best_cells, check_maps, faded, push_mask, pushes, surface_at
+from policy.selection import Candidate, best_cells, check_maps, faded, middles, push_mask, pushes, surface_at
 from policy.surface import cell_centers, estimate_surface
 from robotcell.decision import Action, Primitive
 from robotcell.errors import NoTarget
@@ -157,13 +157,16 @@ class LearnedPolicy:
         )
         single = observation.goal is not None and observation.may_grasp
         goal = int(observation.labels[targets].max()) if single else None
+        middle = middles(observation.labels)
+        if observation.goal is not None:
+            middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), middle.shape)
         mask = targets
         for _ in range(_PUSH_REACHES):
             mask = push_mask(mask | targets, observation.objects)
             q = self._inference.maps(planes, mask, PUSH)
             check_maps(q, mask, "push")
             found: list[_Push] = []
-            for push in pushes(q, mask, height_m, free, self._push_m, resolution_m):
+            for push in pushes(q, mask, middle, height_m, free, self._push_m, resolution_m):
                 x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
                 if repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
                     continue

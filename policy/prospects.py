@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,6 +23,13 @@ if TYPE_CHECKING:
 _GRASPS = 80
 _APART = 2
 _COUNTED = 20
+
+
+class _Alone(NamedTuple):
+    """An object that stands alone in its window: its best grasps, by cells of the window, and its own surface."""
+
+    grasps: Cells
+    table: Table
 
 
 class Prospects:
@@ -54,7 +62,7 @@ class Prospects:
         self._color = color
         self._jaw = jaw
         self._resolution_m = resolution_m
-        self._grasps: dict[int, Cells] = {}
+        self._objects: dict[int, _Alone] = {}
 
     def after(self, label: int, around: npt.NDArray[np.float32]) -> float:
         """About the chance that an object can be grasped after a push.
@@ -65,16 +73,14 @@ class Prospects:
             label: of the object.
             around: what the push makes of its window (`Foresight.around`).
         """
-        grasps = self._alone(label)
-        own = self._foresight.window(label).own
-        top = np.asarray(cv2.medianBlur(np.where(own, around, np.float32(0)), 5), np.float32)
-        table = Table(around, around, top, own.astype(np.int32), pad=0, resolution_m=self._resolution_m)
+        grasps, alone = self._alone(label)
+        table = replace(alone, height_m=around, ceiling_m=around)
         room = finger_room(table, grasps.row, grasps.col, grasps.rotation, self._jaw)
         return float(np.sort(grasps.q * room)[-_COUNTED:].mean())
 
-    def _alone(self, label: int) -> Cells:
-        """The best grasps of an object if all others were gone; cells of its window."""
-        if label not in self._grasps:
+    def _alone(self, label: int) -> _Alone:
+        """An object as if all others were gone."""
+        if label not in self._objects:
             own = self._labels == label
             bare = np.where(own, np.nan_to_num(self._height_m), np.float32(0))
             table = self._labels == 0
@@ -84,5 +90,15 @@ class Prospects:
             check_maps(q, own, "grasp")
             best = best_cells(faded(q, own), thinned(own, _APART), _GRASPS)
             window = self._foresight.window(label)
-            self._grasps[label] = best._replace(row=best.row - window.top, col=best.col - window.left)
-        return self._grasps[label]
+            grasps = best._replace(row=best.row - window.top, col=best.col - window.left)
+            height_m = self._foresight.alone(label)
+            surface = Table(
+                height_m=height_m,
+                ceiling_m=height_m,
+                top_m=np.asarray(cv2.medianBlur(height_m, 5), np.float32),
+                owner=window.own.astype(np.int32),
+                pad=0,
+                resolution_m=self._resolution_m,
+            )
+            self._objects[label] = _Alone(grasps, surface)
+        return self._objects[label]

@@ -116,6 +116,12 @@ def line_from(
     return PushLine(start[0], start[1], float(face.max()), cells)
 
 
+def normal(rotation: int) -> Array:
+    """(2,) unit step in rows and in columns to the side of a push."""
+    along = _direction(rotation)
+    return np.array([along[1], -along[0]])
+
+
 def _direction(rotation: int) -> Array:
     """Steps in rows, which run along y, and in columns, which run along x."""
     theta = 2 * math.pi * rotation / ROTATIONS

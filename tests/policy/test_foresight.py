@@ -42,7 +42,7 @@ def shift(played, label, cell):
     """How far the middle of an object goes [m], along x and y."""
     before = (np.array(cell[::-1]) + 0.5) * RESOLUTION_M
     move = played.moves[label]
-    return move[:, :2] @ before + move[:, 2] - before
+    return move[:2, :2] @ before + move[:2, 2] - before
 
 
 @settings(max_examples=16, derandomize=True, deadline=None)

@@ -53,7 +53,7 @@ class View:
 
 def moved(label, x_m, y_m=0.0, turn=0.0):
     cos, sin = np.cos(turn), np.sin(turn)
-    return Played({label: np.array([[cos, -sin, x_m], [sin, cos, y_m]])}, lost=False)
+    return Played({label: np.array([[cos, -sin, x_m], [sin, cos, y_m], [0, 0, 1]])}, lost=False)
 
 
 def test_an_object_that_stands_alone_promises_the_q_of_its_grasps():
