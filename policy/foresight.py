@@ -192,7 +192,9 @@ class Foresight:
 
     def _prism(self, label: int) -> Prism | None:
         box, own = self._cells[label]
-        height_m = float(np.percentile(self._height_m[box][own], 90))
+        heights = self._height_m[box][own]
+        high = len(heights) * 9 // 10
+        height_m = float(np.partition(heights, high)[high])
         return Prism.of(own, (box[0].start, box[1].start), height_m, self._resolution_m)
 
     def _may_be_lost(self, prism: Prism, move: Array) -> bool:

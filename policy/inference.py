@@ -13,7 +13,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from policy.network import GRASP, GRASP_ROTATIONS, PUSH, PUSH_ROTATIONS
 from policy.precision import autocast
-from policy.rotation import MARGINS, Copies
+from policy.rotation import MARGIN, Copies
 from policy.weights import load_weights
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ class Inference:
             primitive: `GRASP` or `PUSH`.
         """
         rotations = _PLANES[primitive]
-        copies = Copies.around(cells, range(rotations), MARGINS[primitive])
-        x = torch.from_numpy(copies.turn(planes)).to(memory_format=torch.channels_last)
+        copies = Copies.around(cells, range(rotations), MARGIN)
+        x = torch.from_numpy(copies.turn(planes))
         at_once = max(1, _CELLS_AT_ONCE // copies.side**2)
         with torch.inference_mode(), autocast(x.device):
             q = torch.cat([self._network(x[i : i + at_once])[:, primitive] for i in range(0, rotations, at_once)])

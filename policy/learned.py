@@ -157,9 +157,10 @@ class LearnedPolicy:
         )
         single = observation.goal is not None and observation.may_grasp
         goal = int(observation.labels[targets].max()) if single else None
-        middle = middles(observation.labels)
-        if observation.goal is not None:
-            middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), middle.shape)
+        if observation.goal is None:
+            middle = middles(observation.labels)
+        else:
+            middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
         mask = targets
         for _ in range(_PUSH_REACHES):
             mask = push_mask(mask | targets, observation.objects)

@@ -54,7 +54,8 @@ class QNetwork(nn.Module):
         for up in self.up:
             features = up(features, skips.pop())
         q = torch.cat([self.grasp(features), self.push(features)], dim=1)
-        return _enlarge(q, _FOLD)
+        # Two channels are enlarged several times faster one after the other than side by side.
+        return _enlarge(q.float().contiguous(), _FOLD)
 
 
 def _block(inputs: int, outputs: int) -> nn.Sequential:

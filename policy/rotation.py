@@ -19,9 +19,9 @@ from robotcell.decision import ROTATIONS
 if TYPE_CHECKING:
     from robotcell.geometry import Array
 
-# How far around its cell a Q value depends on what stands there [cells]: the fingers' reach, and a push's way. By
-# primitive, grasp and push.
-MARGINS = (40, 56)
+# How far around its cell a Q value depends on what stands there [cells]: the fingers' reach, and what a push meets
+# first. With 40 or 56, values tell labelled attempts apart no better (`docs/policy.md`).
+MARGIN = 32
 # Sides of a copy: the network halves it four times.
 _MULTIPLE = 16
 
@@ -69,14 +69,18 @@ class Copies:
         return Copies(side, turns, rows, cols)
 
     def turn(self, planes: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """(K, C, side, side) copies of planes (C, H, W), 0 where the map does not reach."""
+        """(K, C, side, side) copies of planes (C, H, W), 0 where the map does not reach; in memory, channels come last.
+
+        That is how convolutions want them.
+        """
         image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
         size = (self.side, self.side)
-        turned = [
-            cv2.warpAffine(image, M, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-            for M in self.matrices
-        ]
-        return np.ascontiguousarray(np.moveaxis(np.stack(turned), 3, 1))
+        turned = np.empty((len(self.matrices), *size, len(planes)), np.float32)
+        for M, copy in zip(self.matrices, turned, strict=True):
+            cv2.warpAffine(
+                image, M, size, dst=copy, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+            )
+        return np.moveaxis(turned, 3, 1)
 
     def values(self, maps: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """(K, N) of maps (K, side, side) at the cells."""

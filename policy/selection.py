@@ -20,14 +20,13 @@ if TYPE_CHECKING:
 
 # Paper: 15 dilations of 3x3.
 _DILATIONS = 15
-# Pushes of a rotation that are proposed, in lanes so wide, through cells so far apart [cells], and the cells that are
-# tried for them in the order of their value.
-_PER_ROTATION = 2
-_LANE = 10
+# Pushes are tried through cells so far apart [cells], so many of each rotation in the order of their value, and so many
+# at a time.
 _APART = 3
 _PUSH_TRIES = 400
-# The Q of a push loses so much by each cell that its way passes beside the middle of what it is to free. Of the pushes
-# that help most when played ahead, Q alone finds no more than chance does, and this twice as many.
+_AT_A_TIME = 50
+# The Q of a push loses so much by each cell that its way passes beside the middle of what it is to free: of the pushes
+# that help most when played ahead, Q alone finds no more than chance does (`docs/policy.md`).
 _BESIDE = 0.015
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
 # network, and at an edge the fingers slip. Standard deviation in cells.
@@ -121,7 +120,7 @@ def pushes(
     push_m: float,
     resolution_m: float,
 ) -> Iterator[Candidate]:
-    """Pushes through cells of a mask (H, W) that have a place to begin: of each rotation the best of the best lanes.
+    """Of each rotation, the best push through a cell of a mask (H, W) that has a place to begin.
 
     Args:
         q: (K, H, W) Q maps.
@@ -136,24 +135,28 @@ def pushes(
     values = q[:, cells[:, 0], cells[:, 1]]
     beside = cells - middle[cells[:, 0], cells[:, 1]]
     for k in range(len(q)):
-        across = normal(k)
-        value = values[k] - _BESIDE * np.abs(beside @ across)
-        best = np.argsort(-value, kind="stable")[:_PUSH_TRIES]
-        starts = push_starts(free, cells[best], k, push_m, resolution_m)
-        lanes = np.rint(cells[best] @ across / _LANE)
-        taken = set()
-        for i in np.flatnonzero(starts[:, 0] >= 0):
-            if lanes[i] in taken:
-                continue
-            row, col = int(starts[i, 0]), int(starts[i, 1])
-            line = line_from(height_m, (row, col), k, push_m, resolution_m)
-            if line is None:
-                continue
-            cell = (int(cells[best[i], 0]), int(cells[best[i], 1]))
-            yield Candidate(k, cell, float(values[k, best[i]]), line)
-            taken.add(lanes[i])
-            if len(taken) == _PER_ROTATION:
+        order = np.argsort(_BESIDE * np.abs(beside @ normal(k)) - values[k], kind="stable")[:_PUSH_TRIES]
+        for i, start in _starting(free, cells, order, k, push_m, resolution_m):
+            line = line_from(height_m, start, k, push_m, resolution_m)
+            if line is not None:
+                yield Candidate(k, (int(cells[i, 0]), int(cells[i, 1])), float(values[k, i]), line)
                 break
+
+
+def _starting(
+    free: npt.NDArray[np.bool_],
+    cells: npt.NDArray[np.intp],
+    order: npt.NDArray[np.intp],
+    rotation: int,
+    push_m: float,
+    resolution_m: float,
+) -> Iterator[tuple[int, tuple[int, int]]]:
+    """Those of the cells (N, 2), in an order, through which a push has a place to begin, and that place."""
+    for first in range(0, len(order), _AT_A_TIME):
+        some = order[first : first + _AT_A_TIME]
+        starts = push_starts(free, cells[some], rotation, push_m, resolution_m)
+        for j in np.flatnonzero(starts[:, 0] >= 0):
+            yield int(some[j]), (int(starts[j, 0]), int(starts[j, 1]))
 
 
 def surface_at(height_m: npt.NDArray[np.float32], cell: tuple[int, int]) -> float:

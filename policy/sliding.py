@@ -77,10 +77,10 @@ class Prism:
 
 
 class _Slider(NamedTuple):
-    """A prism's body, and all that stands for it in a space."""
+    """A prism's body, and its shapes and joints."""
 
     body: pymunk.Body
-    all: tuple[pymunk.Body | pymunk.Shape | pymunk.Constraint, ...]
+    parts: tuple[pymunk.Shape | pymunk.Constraint, ...]
 
 
 class SlidingTable:
@@ -95,10 +95,9 @@ class SlidingTable:
         self._centers = np.array([prism.center for prism in prisms.values()]).reshape(-1, 2)
         self._heights = np.array([prism.height_m for prism in prisms.values()])
         self._reaches = np.array([prism.reach_m for prism in prisms.values()])
-        self._space = pymunk.Space()
-        self._space.collision_slop, self._space.collision_bias = _OVERLAP_M, _LEFT_OVERLAP
-        # Bodies take most of the time of a short play: they are made once, and part of the space while they take part.
-        self._sliders = [_slider(self._space, prism) for prism in prisms.values()]
+        self._ground = pymunk.Body(body_type=pymunk.Body.STATIC)
+        # To make bodies takes longer than a push: they are made once, and belong to a space while they take part.
+        self._sliders = [_slider(self._ground, prism) for prism in prisms.values()]
         self._fingers = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._tips = pymunk.Poly.create_box(self._fingers, (2 * linkage.FINGER_THICKNESS_M, linkage.FINGER_BREADTH_M))
         self._tips.friction = _FINGER_FRICTION
@@ -122,18 +121,25 @@ class SlidingTable:
         x, y = start + idle * _SPEED_M_S * _STEP_S * along
         self._fingers.position, self._fingers.angle = (float(x), float(y)), theta
         self._fingers.velocity = (float(_SPEED_M_S * along[0]), float(_SPEED_M_S * along[1]))
+        # A space of its own for every push: joints remember what they held in the last step of their space.
+        space = pymunk.Space()
+        space.collision_slop, space.collision_bias = _OVERLAP_M, _LEFT_OVERLAP
+        space.add(self._ground, self._fingers, self._tips)
         for i in taking_part:
             body = self._sliders[i].body
             body.position, body.angle = tuple(self._centers[i].tolist()), 0.0
             body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
-            self._space.add(*self._sliders[i].all)
-        self._space.add(self._fingers, self._tips)
+            space.add(body, *self._sliders[i].parts)
         for _ in range(steps - idle):
-            self._space.step(_STEP_S)
+            space.step(_STEP_S)
         moves = {self._labels[i]: move for i in taking_part if (move := self._move(i)) is not None}
+        space.remove(self._ground, self._fingers, self._tips)
         for i in taking_part:
-            self._space.remove(*self._sliders[i].all)
-        self._space.remove(self._fingers, self._tips)
+            space.remove(*self._sliders[i].parts)
+        # Uses up what the last step left to each body against its overlaps.
+        space.step(_STEP_S)
+        for i in taking_part:
+            space.remove(self._sliders[i].body)
         return moves
 
     def _ahead(self, start: Array, along: Array, length_m: float, tip_m: float) -> tuple[list[int], float]:
@@ -154,7 +160,7 @@ class SlidingTable:
         return np.array([[cos, -sin, at.x - cos * x + sin * y], [sin, cos, at.y - sin * x - cos * y], [0.0, 0.0, 1.0]])
 
 
-def _slider(space: pymunk.Space, prism: Prism) -> _Slider:
+def _slider(ground: pymunk.Body, prism: Prism) -> _Slider:
     parts = [[(float(x), float(y)) for x, y in part] for part in prism.parts]
     areas = [cv2.contourArea(part.astype(np.float32)) for part in prism.parts]
     # The density is the same for all, and its value without meaning.
@@ -166,11 +172,11 @@ def _slider(space: pymunk.Space, prism: Prism) -> _Slider:
         shape.friction = _OBJECT_FRICTION
     # Coulomb's friction of the table: joints that may slip, and pull back to no place.
     weight = _TABLE_FRICTION * _GRAVITY_M_S2 * body.mass
-    drag = pymunk.PivotJoint(space.static_body, body, (0, 0), (0, 0))
+    drag = pymunk.PivotJoint(ground, body, (0, 0), (0, 0))
     drag.max_bias, drag.max_force = 0.0, weight
-    twist = pymunk.GearJoint(space.static_body, body, 0.0, 1.0)
+    twist = pymunk.GearJoint(ground, body, 0.0, 1.0)
     twist.max_bias, twist.max_force = 0.0, _LEVER * math.sqrt(sum(areas) / math.pi) * weight
-    return _Slider(body, (body, *shapes, drag, twist))
+    return _Slider(body, (*shapes, drag, twist))
 
 
 def _convex_parts(own: npt.NDArray[np.uint8]) -> list[Array]:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import find_objects
+from scipy.spatial.distance import cdist
 
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.palette import PALETTE
@@ -154,22 +155,21 @@ def _palette_features() -> npt.NDArray[np.float32]:
 
 
 def _distances(features: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """(N, colours) distances of (N, 3) features to the palette."""
-    difference = features[:, None] - _palette_features()
-    return np.asarray(np.sqrt(np.einsum("nci,nci->nc", difference, difference)), np.float32)
+    """(colours, N) distances of the palette to (N, 3) features."""
+    return np.asarray(cdist(_palette_features(), features), np.float32)
 
 
 def _colors(heightmap: Heightmap, objects: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
     """(H, W) index of the palette colour that fits each object cell and its surroundings best."""
     known = objects & np.isfinite(heightmap.height_m)
     features = _features(heightmap.color[known])
-    planes = np.zeros((*objects.shape, len(PALETTE)), np.float32)
+    planes = np.zeros((len(PALETTE), *objects.shape), np.float32)
     # Negative: cells without an object weigh nothing, and the largest sum wins.
-    planes[known] = np.minimum(_distances(features), _FAR) - _FAR
+    planes[:, known] = np.minimum(_distances(features), _FAR) - _FAR
     width = _cells(_SMOOTHING_M, heightmap.workspace.resolution_m) | 1
-    for c in range(len(PALETTE)):
-        planes[..., c] = cv2.boxFilter(planes[..., c], -1, (width, width), borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(planes.argmin(axis=2), np.int32)
+    for plane in planes:
+        cv2.boxFilter(plane, -1, (width, width), dst=plane, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(planes.argmin(axis=0), np.int32)
 
 
 def _height_steps(heights: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
@@ -182,13 +182,14 @@ def _components(
     colors: npt.NDArray[np.int32], objects: npt.NDArray[np.bool_], cut: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.int32]:
     """Connected cells of one colour; the cells of a cut join the nearest component."""
-    labels = np.zeros(colors.shape, np.int32)
-    for color in np.unique(colors[objects]):
+    labels, found = np.zeros(colors.shape, np.int32), 0
+    for color in np.flatnonzero(np.bincount(colors[objects])):
         same = objects & (colors == color)
         count, parts = cv2.connectedComponents((same & ~cut).astype(np.uint8), connectivity=4)
         if count == 1:
             count, parts = cv2.connectedComponents(same.astype(np.uint8), connectivity=4)
-        labels = np.where(same, np.where(parts > 0, parts + labels.max(), 0), labels)
+        np.add(parts, found, out=labels, where=parts > 0)
+        found += count - 1
     return _spread(labels, objects)
 
 
@@ -252,11 +253,9 @@ def _necked_parts(
 def _merge_fragments(labels: npt.NDArray[np.int32], resolution_m: float) -> npt.NDArray[np.int32]:
     """Give each patch that is too small or too narrow for an object to the neighbour it touches most."""
     smallest, narrowest = _SMALLEST_M2 / resolution_m**2, _NARROWEST_M / resolution_m
-    count = int(labels.max()) + 1
-    depth = np.zeros(count, np.float32)
-    np.maximum.at(depth, labels.ravel(), _depths(labels).ravel())
-    cells = np.bincount(labels.ravel(), minlength=count)
-    fragments = [n for n in range(1, count) if cells[n] and (cells[n] < smallest or depth[n] < narrowest / 2)]
+    cells = np.bincount(labels.ravel())
+    wide = np.bincount(labels[_depths(labels) >= narrowest / 2], minlength=len(cells)) > 0
+    fragments = [n for n in range(1, len(cells)) if cells[n] and (cells[n] < smallest or not wide[n])]
     labels = labels.copy()
     boxes: dict[int, _Box] = {n: (box[0], box[1]) for n, box in enumerate(find_objects(labels), start=1) if box}
     kernel = np.ones((3, 3), np.uint8)
@@ -275,34 +274,45 @@ def _merge_fragments(labels: npt.NDArray[np.int32], resolution_m: float) -> npt.
 def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentation:
     """Number the instances from the largest and measure them; those of which no cell was seen are left out."""
     seen = np.isfinite(heightmap.height_m)
-    values, counts = np.unique(labels[(labels > 0) & seen], return_counts=True)
+    counts = np.bincount(labels[seen])
+    counts[0] = 0
+    values = np.flatnonzero(counts)
+    counts = counts[values]
     order = np.argsort(-counts, kind="stable")
     renumber = np.zeros(int(labels.max()) + 1, np.int32)
     renumber[values[order]] = np.arange(1, len(values) + 1)
     labels = renumber[labels]
+    boxes = [(box[0], box[1]) for box in find_objects(labels)]
+    masks = [labels[box] == label for label, box in enumerate(boxes, start=1)]
+    known = [mask & seen[box] for mask, box in zip(masks, boxes, strict=True)]
+    names = _names([heightmap.color[box][cells] for cells, box in zip(known, boxes, strict=True)])
     instances = []
-    for label, box in enumerate(find_objects(labels), start=1):
-        mask = labels[box] == label
-        known = mask & seen[box]
-        rows, cols = np.nonzero(mask)
+    for i, box in enumerate(boxes):
+        rows, cols = np.nonzero(masks[i])
+        heights = heightmap.height_m[box][known[i]]
+        high = len(heights) * 95 // 100
         instances.append(
             Instance(
-                label=label,
-                color_name=_name(heightmap.color[box][known]),
+                label=i + 1,
+                color_name=names[i],
                 centroid=heightmap.workspace.position(
                     box[0].start + float(rows.mean()), box[1].start + float(cols.mean())
                 ),
-                height_m=float(np.percentile(heightmap.height_m[box][known], 95)),
+                height_m=float(np.partition(heights, high)[high]),
                 cells=len(rows),
             )
         )
     return Segmentation(labels, tuple(instances))
 
 
-def _name(colors: npt.NDArray[np.uint8]) -> str:
-    """The palette colour of an instance's (N, 3) cells: of their median, which noise and rims do not move."""
-    features = _features(colors[:: max(1, len(colors) // _MEDIAN_CELLS)])
-    return list(PALETTE)[int(_distances(np.median(features, axis=0)[None]).argmin())]
+def _names(colors: list[npt.NDArray[np.uint8]]) -> list[str]:
+    """The palette colours of instances' (N, 3) cells: of their medians, which noise and rims do not move."""
+    if not colors:
+        return []
+    samples = [cells[:: max(1, len(cells) // _MEDIAN_CELLS)] for cells in colors]
+    features = np.split(_features(np.concatenate(samples)), np.cumsum([len(sample) for sample in samples])[:-1])
+    nearest = _distances(np.array([np.median(of_one, axis=0) for of_one in features])).argmin(axis=0)
+    return [list(PALETTE)[i] for i in nearest]
 
 
 _Box: TypeAlias = tuple[slice, slice]

@@ -16,7 +16,7 @@ from torch.nn import functional
 from policy.encoding import encode
 from policy.network import GRASP, GRASP_ROTATIONS, PUSH
 from policy.precision import autocast
-from policy.rotation import MARGINS, Copies
+from policy.rotation import MARGIN, Copies
 from policy.selection import best_cells, faded
 from policy.training.augment import crop
 from policy.training.shard import unpack_height
@@ -167,9 +167,9 @@ class Learner:
         cells = view.labels == goal
         if not cells.any():
             return 0.0
-        copies = Copies.around(cells, range(GRASP_ROTATIONS), MARGINS[GRASP])
+        copies = Copies.around(cells, range(GRASP_ROTATIONS), MARGIN)
         turned = copies.turn(encode(unpack_height(view.height), view.color))
-        x = torch.from_numpy(turned).to(self.device, memory_format=torch.channels_last)
+        x = torch.from_numpy(turned).to(self.device)
         with autocast(self.device):
             q = self.online(x)[:, GRASP].float().cpu().numpy()
         maps = np.zeros((GRASP_ROTATIONS, *cells.shape), np.float32)
