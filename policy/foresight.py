@@ -36,14 +36,14 @@ class Played:
 
     Attributes:
         moves: by label of each object that moved, see `policy.sliding.SlidingTable.push`.
-        lost: whether one of them came so near to the rim of the workspace that it may leave it.
+        lost: labels of those that came so near to the rim of the workspace that they may leave it.
     """
 
     moves: dict[int, Array]
-    lost: bool
+    lost: frozenset[int]
 
 
-_NOTHING = Played({}, lost=False)
+_NOTHING = Played({}, frozenset())
 
 
 class Window(NamedTuple):
@@ -87,7 +87,8 @@ class Foresight:
         length_m = (len(line.cells) - 1) * self._resolution_m
         # The paper pushes at half of the height of what is met.
         moves = self._table.push(start, 2 * math.pi * rotation / ROTATIONS, length_m, line.top_m / 2 + _CLEAR_M)
-        return Played(moves, any(self._may_be_lost(self._prisms[i], move) for i, move in moves.items()))
+        lost = frozenset(i for i, move in moves.items() if self._may_be_lost(self._prisms[i], move))
+        return Played(moves, lost)
 
     def window(self, label: int) -> Window:
         """What is seen of an object and of what stands around it."""

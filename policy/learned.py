@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 _GRASP_THRESHOLD = 0.6
 # Where no push near the targets has a place to begin, the mask grows by the same again, up to so many times in all.
 _PUSH_REACHES = 3
+# Pushes of a rotation that are played ahead; more where a goal is hidden, since it need not lie in the middle of what
+# hides it.
+_LANES, _LANES_TO_SEARCH = 1, 4
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
 # So many of the best grasps are looked at for whether the fingers come down beside what stands around. The network
@@ -40,16 +43,17 @@ _LOOKED_AT = 400
 _BLOCKED = 0.05
 _ROOM_POWER = 0.2
 # Pushes are played ahead: how well the object can be grasped then counts, and with these weights what is freed of its
-# border, the push's Q, and that something may be lost.
+# border, the push's Q, and that anything may be lost, or what is wanted.
 _GAIN_SHARE = 0.3
 _Q_SHARE = 0.1
 _LOSS = 0.3
+_WANTED_LOSS = 1.0
 # A push that frees this much of the border comes before any doubtful grasp (paper: tau of the reward).
 _USEFUL_GAIN = 0.1
 
 
 class _Push(NamedTuple):
-    """A push that was played ahead: what it frees of its object's border, what it promises, and whether one is lost.
+    """A push that was played ahead: what it frees of its object's border, what it promises, and what may be lost by it.
 
     What hides a goal is not to be grasped: there, the promise is the share of its cells that the push uncovers.
     """
@@ -57,10 +61,10 @@ class _Push(NamedTuple):
     candidate: Candidate
     gain: float
     promise: float
-    loses: bool
+    loss: float
 
     def worth(self) -> float:
-        return self.promise + _GAIN_SHARE * self.gain + _Q_SHARE * self.candidate.q - _LOSS * self.loses
+        return self.promise + _GAIN_SHARE * self.gain + _Q_SHARE * self.candidate.q - self.loss
 
     def is_better_than(self, grasp: float) -> bool:
         """Whether it comes before a grasp of that value."""
@@ -155,19 +159,21 @@ class LearnedPolicy:
         prospects = Prospects(
             self._inference, foresight, observation.labels, height_m, heightmap.color, self._jaw, resolution_m
         )
-        single = observation.goal is not None and observation.may_grasp
-        goal = int(observation.labels[targets].max()) if single else None
+        goal = int(observation.labels[targets].max()) if observation.goal is not None else None
         if observation.goal is None:
             middle = middles(observation.labels)
         else:
             middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
+        # Under one of these the goal is, if it is hidden.
+        hiding = set(np.unique(observation.labels[targets]).tolist())
+        lanes = _LANES if observation.may_grasp else _LANES_TO_SEARCH
         mask = targets
         for _ in range(_PUSH_REACHES):
             mask = push_mask(mask | targets, observation.objects)
             q = self._inference.maps(planes, mask, PUSH)
             check_maps(q, mask, "push")
             found: list[_Push] = []
-            for push in pushes(q, mask, middle, height_m, free, self._push_m, resolution_m):
+            for push in pushes(q, mask, middle, height_m, free, self._push_m, resolution_m, lanes):
                 x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
                 if repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
                     continue
@@ -177,9 +183,12 @@ class LearnedPolicy:
                 if observation.may_grasp:
                     around = foresight.around(label, played)
                     gain, promise = foresight.freed(label, around), prospects.after(label, around)
+                    wanted = {label}
                 else:
                     gain, promise = 0.0, foresight.uncovered(targets, played)
-                found.append(_Push(push, gain, promise, played.lost))
+                    wanted = hiding
+                loss = _WANTED_LOSS if played.lost & wanted else _LOSS if played.lost else 0.0
+                found.append(_Push(push, gain, promise, loss))
             if found:
                 return max(found, key=_Push.worth)
         return None

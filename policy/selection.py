@@ -25,9 +25,11 @@ _DILATIONS = 15
 _APART = 3
 _PUSH_TRIES = 400
 _AT_A_TIME = 50
-# The Q of a push loses so much by each cell that its way passes beside the middle of what it is to free: of the pushes
-# that help most when played ahead, Q alone finds no more than chance does (`docs/policy.md`).
+# The Q of a push loses so much by each cell that its way passes beside the middle of what it is to free
+# (`docs/policy.md`).
 _BESIDE = 0.015
+# Pushes side by side whose ways are nearer to each other than this do much the same [cells].
+_LANE = 10
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
 # network, and at an edge the fingers slip. Standard deviation in cells.
 _SMOOTH_CELLS = 1.5
@@ -119,8 +121,9 @@ def pushes(
     free: npt.NDArray[np.bool_],
     push_m: float,
     resolution_m: float,
+    lanes: int,
 ) -> Iterator[Candidate]:
-    """Of each rotation, the best push through a cell of a mask (H, W) that has a place to begin.
+    """Of each rotation, the best pushes through cells of a mask (H, W) that have a place to begin, side by side.
 
     Args:
         q: (K, H, W) Q maps.
@@ -130,16 +133,24 @@ def pushes(
         free: (H, W) cells where the fingers may come down.
         push_m: length of a push.
         resolution_m: size of a cell.
+        lanes: at most so many of a rotation.
     """
     cells = np.argwhere(thinned(mask, _APART))
     values = q[:, cells[:, 0], cells[:, 1]]
     beside = cells - middle[cells[:, 0], cells[:, 1]]
     for k in range(len(q)):
-        order = np.argsort(_BESIDE * np.abs(beside @ normal(k)) - values[k], kind="stable")[:_PUSH_TRIES]
+        aside = beside @ normal(k)
+        order = np.argsort(_BESIDE * np.abs(aside) - values[k], kind="stable")[:_PUSH_TRIES]
+        taken: set[int] = set()
         for i, start in _starting(free, cells, order, k, push_m, resolution_m):
+            if (lane := round(aside[i] / _LANE)) in taken:
+                continue
             line = line_from(height_m, start, k, push_m, resolution_m)
-            if line is not None:
-                yield Candidate(k, (int(cells[i, 0]), int(cells[i, 1])), float(values[k, i]), line)
+            if line is None:
+                continue
+            yield Candidate(k, (int(cells[i, 0]), int(cells[i, 1])), float(values[k, i]), line)
+            taken.add(lane)
+            if len(taken) == lanes:
                 break
 
 

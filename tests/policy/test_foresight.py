@@ -122,8 +122,9 @@ def test_cells_are_uncovered_by_what_leaves_them():
 
 
 def test_what_ends_at_the_rim_may_be_lost():
-    assert Table((100, 180, 25, 25)).push((112, 192), 0)[2].lost
+    assert Table((100, 180, 25, 25)).push((112, 192), 0)[2].lost == {1}
     assert not Table((100, 180, 25, 25)).push((112, 192), 8)[2].lost
+    assert Table((100, 130, 25, 25), (100, 165, 25, 25)).push((112, 142), 0)[2].lost == {2}
 
 
 def test_the_same_push_gives_the_same():

@@ -13,7 +13,7 @@ from robotcell.errors import ConfigError
 CONFIG = CellConfig()
 RESOLUTION_M = CONFIG.workspace.resolution_m
 JAW = Jaw(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
-STAYS = Played({}, lost=False)
+STAYS = Played({}, frozenset())
 
 
 class Network:
@@ -53,7 +53,7 @@ class View:
 
 def moved(label, x_m, y_m=0.0, turn=0.0):
     cos, sin = np.cos(turn), np.sin(turn)
-    return Played({label: np.array([[cos, -sin, x_m], [sin, cos, y_m], [0, 0, 1]])}, lost=False)
+    return Played({label: np.array([[cos, -sin, x_m], [sin, cos, y_m], [0, 0, 1]])}, frozenset())
 
 
 def test_an_object_that_stands_alone_promises_the_q_of_its_grasps():
@@ -68,7 +68,7 @@ def test_a_push_that_takes_a_neighbour_away_promises_more():
     view = View((100, 100), (100, 73), (100, 127))
     before = view.promise()
     one = view.promise(played=moved(2, -0.05))
-    both = view.promise(played=Played({**moved(2, -0.05).moves, **moved(3, 0.05).moves}, lost=False))
+    both = view.promise(played=Played({**moved(2, -0.05).moves, **moved(3, 0.05).moves}, frozenset()))
     assert before == one  # the other finger still finds no room
     assert both > before + 0.5
 

@@ -100,7 +100,7 @@ BLOCK = np.s_[90:134, 90:134]
 MIDDLE = (111.5, 111.5)
 
 
-def proposed(q, *, wall=None):
+def proposed(q, *, wall=None, lanes=1):
     """Pushes of a block of 88 x 88 mm in the middle of the table, with or without a wall."""
     height_m = np.zeros(CONFIG.workspace.shape, np.float32)
     height_m[BLOCK] = 0.05
@@ -110,7 +110,7 @@ def proposed(q, *, wall=None):
     free = free_to_descend(height_m, CONFIG.workspace)
     middle = np.broadcast_to(np.array(MIDDLE), (*height_m.shape, 2))
     maps = np.broadcast_to(q, (16, *height_m.shape)) * mask
-    return list(pushes(maps, mask, middle, height_m, free, PUSH_M, RESOLUTION_M))
+    return list(pushes(maps, mask, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes))
 
 
 def test_where_all_pushes_are_worth_the_same_they_go_through_the_middle():
@@ -138,3 +138,14 @@ def test_a_direction_without_a_place_to_begin_has_no_push():
     found = proposed(np.float32(0.5), wall=np.s_[60:164, 30:90])
     assert 0 not in {push.rotation for push in found}
     assert 8 in {push.rotation for push in found}
+
+
+def test_more_lanes_lie_side_by_side():
+    one, many = proposed(np.float32(0.5)), proposed(np.float32(0.5), lanes=4)
+    assert len(many) == 64
+    for rotation in range(16):
+        ways = [push for push in many if push.rotation == rotation]
+        assert ways[0].cell == one[rotation].cell
+        theta = rotation * np.pi / 8
+        aside = [push.cell[0] * np.cos(theta) - push.cell[1] * np.sin(theta) for push in ways]
+        assert np.diff(np.sort(aside)).min() > 3
