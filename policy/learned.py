@@ -159,13 +159,10 @@ class LearnedPolicy:
         prospects = Prospects(
             self._inference, foresight, observation.labels, height_m, heightmap.color, self._jaw, resolution_m
         )
-        goal = int(observation.labels[targets].max()) if observation.goal is not None else None
         if observation.goal is None:
             middle = middles(observation.labels)
         else:
             middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
-        # Under one of these the goal is, if it is hidden.
-        hiding = set(np.unique(observation.labels[targets]).tolist())
         lanes = _LANES if observation.may_grasp else _LANES_TO_SEARCH
         mask = targets
         for _ in range(_PUSH_REACHES):
@@ -175,20 +172,8 @@ class LearnedPolicy:
             found: list[_Push] = []
             for push in pushes(q, mask, middle, height_m, free, self._push_m, resolution_m, lanes):
                 x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
-                if repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
-                    continue
-                played = foresight.play(push.line, push.rotation)
-                # Without a goal, whatever the push goes through is what it is to free.
-                label = int(observation.labels[push.cell]) if goal is None else goal
-                if observation.may_grasp:
-                    around = foresight.around(label, played)
-                    gain, promise = foresight.freed(label, around), prospects.after(label, around)
-                    wanted = {label}
-                else:
-                    gain, promise = 0.0, foresight.uncovered(targets, played)
-                    wanted = hiding
-                loss = _WANTED_LOSS if played.lost & wanted else _LOSS if played.lost else 0.0
-                found.append(_Push(push, gain, promise, loss))
+                if not repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
+                    found.append(_play(push, observation, targets, foresight, prospects))
             if found:
                 return max(found, key=_Push.worth)
         return None
@@ -197,6 +182,27 @@ class LearnedPolicy:
         line = push.line
         xyz = (*observation.heightmap.workspace.position(line.row, line.col), self._table_height_m + line.top_m)
         return Action(Primitive.PUSH, line.row, line.col, push.rotation, xyz, push.q)
+
+
+def _play(
+    push: Candidate,
+    observation: Observation,
+    targets: npt.NDArray[np.bool_],
+    foresight: Foresight,
+    prospects: Prospects,
+) -> _Push:
+    """What comes of a push for the targets, or without a goal for the object that it goes through."""
+    labels = observation.labels
+    wanted = {int(labels[push.cell])} if observation.goal is None else set(np.unique(labels[targets]).tolist())
+    played = foresight.play(push.line, push.rotation)
+    if observation.may_grasp:
+        label = max(wanted)
+        around = foresight.around(label, played)
+        gain, promise = foresight.freed(label, around), prospects.after(label, around)
+    else:
+        gain, promise = 0.0, foresight.uncovered(targets, played)
+    loss = _WANTED_LOSS if played.lost & wanted else _LOSS if played.lost else 0.0
+    return _Push(push, gain, promise, loss)
 
 
 def _allowed(
