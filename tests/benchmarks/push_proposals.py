@@ -1,13 +1,17 @@
 """Which pushes are worth playing ahead: `python -m tests.benchmarks.push_proposals`.
 
-Scenes of training kinds and unseen seeds. Pushes of the object with the fullest border are chosen in several ways and
-played; prints how many they are, and what the best of them promises, on average.
+Scenes of training kinds and unseen seeds, where the goal is the object with the fullest border, and the ten of the
+suite `challenging`. Pushes are chosen in several ways and played; prints how many they are, and what the best of them
+promises, on average.
 """
 
 import sys
 from collections import defaultdict
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from rich.progress import track
 
 from policy.encoding import encode
@@ -16,12 +20,17 @@ from policy.grasping import Jaw
 from policy.inference import Inference
 from policy.network import PUSH
 from policy.prospects import Prospects
-from policy.push_line import push_line
+from policy.push_line import free_to_descend, push_line
 from policy.selection import push_mask, pushes
 from policy.training.environment import PushGraspEnv
 from policy.weights import load_named
+from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.decision import ROTATIONS
+from robotcell.heightmap import close_gaps
+from robotcell.jobs import look
+from robotcell.perception import find_goal, segment
+from sim_twin.scenes import scene_names
 
 KINDS = ("enclosed", "packed")
 SCENES = 60
@@ -35,13 +44,46 @@ RESOLUTION_M, PUSH_M = CONFIG.workspace.resolution_m, CONFIG.motion.push_m
 JAW = Jaw(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
 
 
-def promises(env: PushGraspEnv, inference: Inference, rng: np.random.Generator) -> dict[str, list[float]]:
+class View(NamedTuple):
+    """Heights with closed gaps and labels (H, W), colours (H, W, 3), and the label of the goal."""
+
+    height_m: npt.NDArray[np.float32]
+    labels: npt.NDArray[np.int32]
+    color: npt.NDArray[np.uint8]
+    goal: int
+
+
+def training(kind: str) -> Iterator[View]:
+    """Of scenes of a training kind."""
+    env = PushGraspEnv(CONFIG, 2)
+    for seed in range(FIRST_SEED, FIRST_SEED + SCENES):
+        count = int(np.random.default_rng(seed).integers(*COUNT))
+        env.reset(seed=seed, options={"kind": kind, "count": count})
+        state = env.state
+        if state.occupied:
+            goal = max(state.occupied, key=lambda label: state.occupied[label])
+            yield View(state.height_m, state.labels.astype(np.int32), state.heightmap.color, goal)
+    env.close()
+
+
+def challenging() -> Iterator[View]:
+    """Of the suite `challenging`, the goal the red one."""
+    for name in scene_names():
+        if not name.startswith("challenging"):
+            continue
+        config = load_config(None, {"backend.options.scene": name})
+        with open_cell(config) as cell:
+            heightmap = look(cell).heightmap
+        seen = segment(heightmap)
+        yield View(close_gaps(heightmap.height_m), seen.labels, heightmap.color, find_goal(seen, "red").label)
+
+
+def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict[str, list[float]]:
     """What pushes promise, by the way they were chosen."""
-    state = env.state
-    goal = max(state.occupied, key=lambda label: state.occupied[label])
-    labels, height_m, color = state.labels.astype(np.int32), state.height_m, state.heightmap.color
+    height_m, labels, color, goal = view
     targets = labels == goal
     mask = push_mask(targets, labels > 0)
+    free = free_to_descend(height_m, CONFIG.workspace)
     q = inference.maps(encode(height_m, color), mask, PUSH)
     foresight = Foresight(labels, height_m, RESOLUTION_M)
     prospects = Prospects(inference, foresight, labels, height_m, color, JAW, RESOLUTION_M)
@@ -50,7 +92,7 @@ def promises(env: PushGraspEnv, inference: Inference, rng: np.random.Generator) 
         return prospects.after(goal, foresight.around(goal, foresight.play(line, rotation)))
 
     def proposed(middle):
-        chosen = pushes(q, mask, middle, height_m, state.free, PUSH_M, RESOLUTION_M, lanes=1)
+        chosen = pushes(q, mask, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
         return [promise(push.line, push.rotation) for push in chosen]
 
     cells = np.argwhere(mask)
@@ -58,7 +100,7 @@ def promises(env: PushGraspEnv, inference: Inference, rng: np.random.Generator) 
     for _ in range(4 * MANY):
         row, col = cells[rng.integers(len(cells))].tolist()
         rotation = int(rng.integers(ROTATIONS))
-        line = push_line(height_m, state.free, (row, col), rotation, PUSH_M, RESOLUTION_M)
+        line = push_line(height_m, free, (row, col), rotation, PUSH_M, RESOLUTION_M)
         if line is not None:
             drawn.append(promise(line, rotation))
         if len(drawn) == MANY:
@@ -75,20 +117,15 @@ def promises(env: PushGraspEnv, inference: Inference, rng: np.random.Generator) 
 
 def main() -> None:
     """Print a table of each kind."""
-    inference, env = Inference(load_named("learned")[0]), PushGraspEnv(CONFIG, 2)
-    for kind in KINDS:
+    inference, rng = Inference(load_named("learned")[0]), np.random.default_rng(0)
+    for kind, views in (("challenging", challenging()), *((kind, training(kind)) for kind in KINDS)):
         best, count = defaultdict(list), defaultdict(list)
-        for seed in track(range(FIRST_SEED, FIRST_SEED + SCENES), kind):
-            rng = np.random.default_rng(seed)
-            env.reset(seed=seed, options={"kind": kind, "count": int(rng.integers(*COUNT))})
-            if not env.state.occupied:
-                continue
-            for name, found in promises(env, inference, rng).items():
+        for view in track(views, kind, total=SCENES if kind in KINDS else 10):
+            for name, found in promises(view, inference, rng).items():
                 best[name].append(max(found, default=0.0))
                 count[name].append(len(found))
         for name, values in best.items():
             sys.stdout.write(f"{kind}: {name}: {np.mean(count[name]):.0f} pushes, best promise {np.mean(values):.2f}\n")
-    env.close()
 
 
 if __name__ == "__main__":
