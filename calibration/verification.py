@@ -15,7 +15,7 @@ import numpy.typing as npt
 from robotcell import linkage
 from robotcell.errors import CalibrationError
 from robotcell.executor import Ending, Executor
-from robotcell.heightmap import Heightmap, TablePlane, build_heightmap, close_gaps
+from robotcell.heightmap import Heightmap, TablePlane, build_heightmap
 from robotcell.jobs import look
 from robotcell.kinematics import inverse
 from robotcell.primitives import Grip, JointMove, LinearMove, MotionPlan, Step, flange_pose, plan_retreat, tool_down
@@ -122,7 +122,7 @@ def choose_spots(cell: Cell, count: int) -> tuple[TablePlane, list[Array]]:
         build_heightmap(cell.camera.read(), config.camera.pose(), config.workspace, config.table.height_m)
         for _ in range(_FRAMES)
     ]
-    stack = np.ma.masked_invalid(np.stack([close_gaps(m.height_m) for m in maps]))
+    stack = np.ma.masked_invalid(np.stack([m.closed_m for m in maps]))
     heights = stack.mean(axis=0).filled(np.nan)
     bare = _bare(heights, maps[0])
     spots: list[Array] = []

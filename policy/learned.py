@@ -20,7 +20,6 @@ from policy.selection import Candidate, best_cells, check_maps, faded, middles, 
 from policy.surface import cell_centers, estimate_surface
 from robotcell.decision import Action, Primitive
 from robotcell.errors import NoTarget
-from robotcell.heightmap import close_gaps
 
 if TYPE_CHECKING:
     from policy.inference import Inference
@@ -103,7 +102,7 @@ class LearnedPolicy:
             ConfigError: the network's maps are not finite, flat or empty.
         """
         targets = observation.targets()
-        height_m = close_gaps(observation.heightmap.height_m)
+        height_m = observation.heightmap.closed_m
         planes = encode(height_m, observation.heightmap.color)
         may_push = observation.may_push and self._may_push
         grasp = self._grasp(observation, planes, targets, height_m) if observation.may_grasp else None

@@ -13,8 +13,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robotcell.heightmap import close_gaps
-
 if TYPE_CHECKING:
     from robotcell.config import Workspace
     from robotcell.geometry import Array
@@ -64,8 +62,7 @@ def estimate_surface(
         wanted: (H, W) where it is to be complete; elsewhere unknown cells are left NaN. None for everywhere.
     """
     workspace = heightmap.workspace
-    known = close_gaps(heightmap.height_m)
-    known = _without_spikes(known)
+    known = _without_spikes(heightmap.closed_m)
     unknown = np.isnan(known)
     rows, cols = np.nonzero(unknown if wanted is None else unknown & wanted)
     height, ceiling = known.copy(), known

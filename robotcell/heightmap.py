@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -80,6 +80,13 @@ class Heightmap:
     masks: Mapping[str, npt.NDArray[np.bool_]]
     t: float
 
+    @cached_property
+    def closed_m(self) -> npt.NDArray[np.float32]:
+        """`height_m` with the gaps between pixels closed (`close_gaps`); read-only."""
+        closed = close_gaps(self.height_m)
+        closed.flags.writeable = False
+        return closed
+
     def filled(self) -> npt.NDArray[np.float32]:
         """The heights (H, W) [m] without NaN, for what cannot work with unknown cells.
 
@@ -88,7 +95,7 @@ class Heightmap:
         takes the table's level 0, the only value that does not invent an object. Whoever plans a motion must
         therefore ask `height_m` whether a cell was seen at all.
         """
-        return np.nan_to_num(close_gaps(self.height_m), copy=False, nan=0.0)
+        return np.nan_to_num(self.closed_m, nan=0.0)
 
 
 def close_gaps(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

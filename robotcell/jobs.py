@@ -18,7 +18,7 @@ from robotcell.decision import Action, Observation, Policy, Primitive
 from robotcell.drift import check_tags
 from robotcell.errors import CalibrationError, CellError, ConfigError, DeviceFault, NoTarget, UnsafeMotion
 from robotcell.executor import Ending, Execution, Executor
-from robotcell.heightmap import Heightmap, build_heightmap, close_gaps
+from robotcell.heightmap import Heightmap, build_heightmap
 from robotcell.journal import ActionRow, Frame, Journal, Metrics, OutcomeRow
 from robotcell.perception import Instance, Segmentation, find_goal, segment
 from robotcell.primitives import HELD_AFTER_LIFT, plan_action, plan_retreat
@@ -153,7 +153,7 @@ def look(cell: Cell) -> View:
         check_tags(frame.color, config.camera.measured.tags)
     heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
     # Without the gaps between pixels, which say something of the resolution and nothing of the view.
-    coverage = float(np.isfinite(close_gaps(heightmap.height_m)).mean())
+    coverage = float(np.isfinite(heightmap.closed_m).mean())
     if coverage < limits.min_coverage:
         raise DeviceFault(
             f"the camera sees {coverage:.0%} of the workspace (limit {limits.min_coverage:.0%}): check its view, its "

@@ -15,7 +15,6 @@ from robotcell import kinematics, linkage
 from robotcell.decision import Action, Primitive
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import Array, invert_transform, make_transform
-from robotcell.heightmap import close_gaps
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
@@ -282,7 +281,7 @@ def _clear_above(heightmap: Heightmap, x: float, y: float, theta: float, opening
     row = np.floor((y + u * math.sin(theta) + v * math.cos(theta) - workspace.y[0]) / workspace.resolution_m)
     rows, cols = workspace.shape
     inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
-    heights = close_gaps(heightmap.height_m)[row[inside].astype(np.intp), col[inside].astype(np.intp)]
+    heights = heightmap.closed_m[row[inside].astype(np.intp), col[inside].astype(np.intp)]
     seen = heights[np.isfinite(heights)]
     highest = max(0.0, float(seen.max())) if seen.size else 0.0
     return highest if inside.all() and seen.size == heights.size else max(highest, TALLEST_OBJECT_M)

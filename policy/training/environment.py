@@ -27,7 +27,7 @@ from robotcell.config import CameraMount, CellConfig
 from robotcell.decision import ROTATIONS
 from robotcell.errors import ConfigError
 from robotcell.geometry import look_at, make_transform
-from robotcell.heightmap import Heightmap, build_heightmap, close_gaps
+from robotcell.heightmap import Heightmap, build_heightmap
 from robotcell.perception import MIN_OBJECT_M
 from robotcell.primitives import grasp_height, near_height, push_height
 from sim_twin.backend import TwinOptions
@@ -264,7 +264,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         for bit in range(_BITS):
             labels |= heightmap.masks[str(bit)].astype(np.uint8) << np.uint8(bit)
         heightmap = replace(heightmap, masks={})
-        height_m = close_gaps(heightmap.height_m)
+        height_m = heightmap.closed_m
         with np.errstate(invalid="ignore"):
             high = height_m > MIN_OBJECT_M
         labels = np.where(high, np.where(labels == 0, cv2.dilate(labels, np.ones((3, 3), np.uint8)), labels), 0)

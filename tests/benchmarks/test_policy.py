@@ -7,6 +7,7 @@ Targets on two cores at 640x480: frame to action 60 ms, and the paper's network 
 import statistics
 import sys
 import time
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -22,11 +23,13 @@ from policy.weights import load_named
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.decision import Observation, Primitive
+from robotcell.errors import NoTarget
 from robotcell.heightmap import build_heightmap, close_gaps
 from robotcell.perception import find_goal, segment
 
 OBJECTS = 30
 ROUNDS = 20
+SCENES = 20
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +95,37 @@ def test_decide(benchmark, heightmap, policy, may_push, primitive):
 @decisions
 def test_frame_to_action(benchmark, config, frame, policy, may_push, primitive):
     assert benchmark(frame_to_action, config, frame, policy, may_push=may_push).primitive is primitive
+
+
+def test_frames_to_actions(benchmark):
+    """First decisions among 30 objects, whatever they are; as in the suite `random`, where the goal is seen."""
+    times = defaultdict(list)
+
+    def decide_all():
+        for seed in range(SCENES):
+            scene = {"seed": seed, "scene": "random-goal", "objects": OBJECTS}
+            config = load_config(None, {f"backend.options.{name}": value for name, value in scene.items()})
+            with open_cell(config) as cell:
+                frame = cell.camera.read()
+            policy = make_policy("learned", config)
+            for _ in range(ROUNDS // 4):
+                started = time.perf_counter()
+                heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+                segmentation = segment(heightmap)
+                try:
+                    goal = segmentation.mask(find_goal(segmentation, "red"))
+                except NoTarget:
+                    break
+                action = policy.decide(Observation(heightmap, segmentation.labels, goal, (), may_push=True))
+                times[action.primitive].append(time.perf_counter() - started)
+
+    benchmark.pedantic(decide_all, rounds=1)
+    every = [seconds for found in times.values() for seconds in found]
+    parts = [
+        f"{primitive.value} {1000 * statistics.median(found):.0f} ms ({len(found)})"
+        for primitive, found in times.items()
+    ]
+    sys.stdout.write(f"\nframe to action, median: {', '.join(parts)}, all {1000 * statistics.median(every):.0f} ms\n")
 
 
 def test_beside_the_paper_network(benchmark, config, frame, heightmap, policy):

@@ -136,7 +136,13 @@ def test_filling_closes_gaps_and_leaves_shadows_at_the_table():
     heights[60:62, 60:62] = np.nan  # drop-out on the object
     heights[120, 120] = np.nan  # and on the table
     heights[50:75, 75:90] = np.nan  # the object's shadow
-    filled = heightmap(heights).filled()
+    seen = heightmap(heights)
+    filled = seen.filled()
+    filled[0, 0] = 9.0  # a copy of its own
+    assert np.isnan(seen.closed_m[52:73, 76:90]).all()
+    assert not seen.filled()[0, 0]
+    with pytest.raises(ValueError, match="read-only"):
+        seen.closed_m[0, 0] = 9.0
     assert np.isfinite(filled).all()
     assert (filled[50:75, 50:75] == np.float32(0.05)).all()
     assert filled[120, 120] == 0
