@@ -97,7 +97,7 @@ def test_a_convex_outline_is_one_part():
     "boxes",
     [
         [(20, 20, 60, 12), (68, 20, 12, 60)],
-        [(20, 20, 60, 12), (68, 20, 12, 60), (30, 50, 20, 20)],
+        [(20, 20, 60, 12), (68, 20, 12, 60), (24, 40, 36, 36)],
     ],
     ids=["an angle", "an angle with a piece of its own between its arms"],
 )
