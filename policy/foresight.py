@@ -14,6 +14,7 @@ from scipy.ndimage import find_objects
 from policy.border import border_cells, stands
 from policy.sliding import Prism, SlidingTable
 from robotcell.decision import ROTATIONS
+from robotcell.heightmap import upper_height
 from robotcell.perception import MIN_OBJECT_M
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class Foresight:
     def __init__(self, labels: npt.NDArray[np.integer], height_m: npt.NDArray[np.float32], resolution_m: float) -> None:
         self._height_m = np.nan_to_num(height_m, nan=0.0)
         self._resolution_m = resolution_m
+        self._pad = math.ceil(_AROUND_M / resolution_m)
         boxes = find_objects(labels)
         self._cells = {i: (box, labels[box] == i) for i, box in enumerate(boxes, start=1) if box is not None}
         self._alone = {i: np.where(own, self._height_m[box], np.float32(0)) for i, (box, own) in self._cells.items()}
@@ -94,18 +96,13 @@ class Foresight:
         """What is seen of an object and of what stands around it."""
         if label not in self._windows:
             (rows, cols), own = self._cells[label]
-            pad = math.ceil(_AROUND_M / self._resolution_m)
-            border = border_cells(np.pad(own, pad))
-            self._windows[label] = Window(rows.start - pad, cols.start - pad, np.pad(own, pad), border)
+            shown = np.pad(own, self._pad)
+            self._windows[label] = Window(rows.start - self._pad, cols.start - self._pad, shown, border_cells(shown))
         return self._windows[label]
 
     def alone(self, label: int) -> npt.NDArray[np.float32]:
         """(h, w) heights in the window of an object if there were no other."""
-        window = self.window(label)
-        heights = np.zeros(window.own.shape, np.float32)
-        box, cells = self._cells[label]
-        heights[window.own] = self._height_m[box][cells]
-        return heights
+        return np.pad(self._alone[label], self._pad)
 
     def around(self, label: int, played: Played) -> npt.NDArray[np.float32]:
         """(h, w) heights in the window of an object after a push; the window goes and turns with the object."""
@@ -113,8 +110,7 @@ class Foresight:
         here = played.moves.get(label, _STAYS)
         others = {other: move for other, move in played.moves.items() if other != label}
         heights = self._after((window.top, window.left), window.own.shape, here, others, {*others, label})
-        box, cells = self._cells[label]
-        heights[window.own] = self._height_m[box][cells]
+        np.copyto(heights, self.alone(label), where=window.own)
         return heights
 
     def uncovered(self, cells: npt.NDArray[np.bool_], played: Played) -> float:
@@ -193,9 +189,7 @@ class Foresight:
 
     def _prism(self, label: int) -> Prism | None:
         box, own = self._cells[label]
-        heights = self._height_m[box][own]
-        high = len(heights) * 9 // 10
-        height_m = float(np.partition(heights, high)[high])
+        height_m = upper_height(self._height_m[box][own], 90)
         return Prism.of(own, (box[0].start, box[1].start), height_m, self._resolution_m)
 
     def _may_be_lost(self, prism: Prism, move: Array) -> bool:

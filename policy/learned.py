@@ -162,6 +162,8 @@ class LearnedPolicy:
             middle = middles(observation.labels)
         else:
             middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
+        # Under one of these a hidden goal is.
+        wanted = set(np.unique(observation.labels[targets]).tolist()) if observation.goal is not None else None
         lanes = _LANES if observation.may_grasp else _LANES_TO_SEARCH
         mask = targets
         for _ in range(_PUSH_REACHES):
@@ -172,7 +174,8 @@ class LearnedPolicy:
             for push in pushes(q, mask, middle, height_m, free, self._push_m, resolution_m, lanes):
                 x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
                 if not repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
-                    found.append(_play(push, observation, targets, foresight, prospects))
+                    aims = wanted or {int(observation.labels[push.cell])}
+                    found.append(_play(push, aims, None if observation.may_grasp else targets, foresight, prospects))
             if found:
                 return max(found, key=_Push.worth)
         return None
@@ -185,21 +188,27 @@ class LearnedPolicy:
 
 def _play(
     push: Candidate,
-    observation: Observation,
-    targets: npt.NDArray[np.bool_],
+    wanted: set[int],
+    hiding: npt.NDArray[np.bool_] | None,
     foresight: Foresight,
     prospects: Prospects,
 ) -> _Push:
-    """What comes of a push for the targets, or without a goal for the object that it goes through."""
-    labels = observation.labels
-    wanted = {int(labels[push.cell])} if observation.goal is None else set(np.unique(labels[targets]).tolist())
+    """What comes of a push.
+
+    Args:
+        push: to be played.
+        wanted: labels of what it is for: one object, or those that may hide the goal.
+        hiding: (H, W) cells that hide the goal, None where it is seen.
+        foresight: of the view.
+        prospects: of the view.
+    """
     played = foresight.play(push.line, push.rotation)
-    if observation.may_grasp:
+    if hiding is None:
         label = max(wanted)
         around = foresight.around(label, played)
         gain, promise = foresight.freed(label, around), prospects.after(label, around)
     else:
-        gain, promise = 0.0, foresight.uncovered(targets, played)
+        gain, promise = 0.0, foresight.uncovered(hiding, played)
     loss = _WANTED_LOSS if played.lost & wanted else _LOSS if played.lost else 0.0
     return _Push(push, gain, promise, loss)
 

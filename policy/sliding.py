@@ -65,9 +65,9 @@ class Prism:
     @staticmethod
     def of(own: npt.NDArray[np.bool_], corner: tuple[int, int], height_m: float, resolution_m: float) -> Prism | None:
         """From the cells (h, w) of an object, the first at row and column `corner`; None for less than an object."""
-        if np.count_nonzero(own) < _LEAST_CELLS:
-            return None
         rows, cols = np.nonzero(own)
+        if len(rows) < _LEAST_CELLS:
+            return None
         middle = np.array([cols.mean(), rows.mean()])
         parts = tuple((part - middle) * resolution_m for part in _convex_parts(own.astype(np.uint8)))
         if not parts:

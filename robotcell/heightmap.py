@@ -119,6 +119,12 @@ def close_gaps(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return heights
 
 
+def upper_height(height_m: npt.NDArray[np.float32], percent: int) -> float:
+    """The height that so many percent (0 to 99) of heights (N,), N > 0, do not exceed: a top that noise does not lift."""
+    rank = len(height_m) * percent // 100
+    return float(np.partition(height_m, rank)[rank])
+
+
 def build_heightmap(
     frame: RgbdFrame,
     T_base_camera: Array,

@@ -14,6 +14,7 @@ from scipy.ndimage import find_objects
 from scipy.spatial.distance import cdist
 
 from robotcell.errors import ConfigError, NoTarget
+from robotcell.heightmap import upper_height
 from robotcell.palette import PALETTE
 
 if TYPE_CHECKING:
@@ -289,8 +290,6 @@ def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentati
     instances = []
     for i, box in enumerate(boxes):
         rows, cols = np.nonzero(masks[i])
-        heights = heightmap.height_m[box][known[i]]
-        high = len(heights) * 95 // 100
         instances.append(
             Instance(
                 label=i + 1,
@@ -298,7 +297,7 @@ def _describe(labels: npt.NDArray[np.int32], heightmap: Heightmap) -> Segmentati
                 centroid=heightmap.workspace.position(
                     box[0].start + float(rows.mean()), box[1].start + float(cols.mean())
                 ),
-                height_m=float(np.partition(heights, high)[high]),
+                height_m=upper_height(heightmap.height_m[box][known[i]], 95),
                 cells=len(rows),
             )
         )
