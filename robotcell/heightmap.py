@@ -120,7 +120,7 @@ def close_gaps(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def upper_height(height_m: npt.NDArray[np.float32], percent: int) -> float:
-    """The height that so many percent (0 to 99) of heights (N,), N > 0, do not exceed: a top that noise does not lift."""
+    """The height that so many percent (0 to 99) of heights (N,), N > 0, do not exceed: a top without its noise."""
     rank = len(height_m) * percent // 100
     return float(np.partition(height_m, rank)[rank])
 

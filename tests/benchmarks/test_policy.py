@@ -15,9 +15,13 @@ import torch
 
 from policy import make_policy
 from policy.encoding import encode
+from policy.foresight import Foresight
+from policy.grasping import Jaw
 from policy.inference import Inference
 from policy.network import GRASP, PUSH
 from policy.networks import make_network
+from policy.prospects import Prospects
+from policy.push_line import free_to_descend, push_line
 from policy.selection import push_mask
 from policy.weights import load_named
 from robotcell.cell import open_cell
@@ -78,6 +82,26 @@ def test_maps(benchmark, heightmap, inference, primitive):
     planes, observation = encode(close_gaps(heightmap.height_m), heightmap.color), observe(heightmap)
     cells = observation.goal if primitive == GRASP else push_mask(observation.goal, observation.objects)
     assert np.isfinite(benchmark(inference.maps, planes, cells, primitive)[:, cells]).all()
+
+
+def test_play(benchmark, config, heightmap, inference):
+    """One push, and what it promises for the goal."""
+    observation = observe(heightmap)
+    goal, height_m = int(observation.labels[observation.goal].max()), heightmap.closed_m
+    resolution_m = config.workspace.resolution_m
+    free = free_to_descend(height_m, config.workspace)
+    cells = np.argwhere(push_mask(observation.goal, observation.objects)).tolist()
+    lines = (push_line(height_m, free, cell, 0, config.motion.push_m, resolution_m) for cell in cells)
+    line = next(line for line in lines if line is not None)
+    foresight = Foresight(observation.labels, height_m, resolution_m)
+    jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+    prospects = Prospects(inference, foresight, observation.labels, height_m, heightmap.color, jaw, resolution_m)
+
+    def play():
+        around = foresight.around(goal, foresight.play(line, 0))
+        return foresight.freed(goal, around), prospects.after(goal, around)
+
+    assert np.isfinite(benchmark(play)).all()
 
 
 # The goal of this frame needs a push; where none is allowed, the decision costs what a clear grasp costs.
