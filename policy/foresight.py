@@ -20,12 +20,15 @@ from robotcell.perception import MIN_OBJECT_M
 if TYPE_CHECKING:
     from policy.push_line import PushLine
     from robotcell.geometry import Array
+    from robotcell.heightmap import Heightmap
 
 # What is pushed nearer to the rim of the map than this, and not just along it, may leave it or leaves no room for a
 # finger.
 _RIM_M = 0.03
 # The window of an object shows so much around it: farther than fingers that grasp it reach, and than its border.
 _AROUND_M = 0.07
+# An outline is where most of what is so far around was seen to be the object's.
+_SPECKS_M = 0.010
 _STAYS = np.eye(3)
 # The fingers pass over what is lower than their tips, with so much to spare.
 _CLEAR_M = 0.002
@@ -67,14 +70,14 @@ class Foresight:
 
     Args:
         labels: (H, W) the object in each cell, 0 for none.
-        height_m: (H, W) with closed gaps, NaN where nothing was seen.
-        resolution_m: size of a cell.
+        heightmap: what is seen.
     """
 
-    def __init__(self, labels: npt.NDArray[np.integer], height_m: npt.NDArray[np.float32], resolution_m: float) -> None:
-        self._height_m = np.nan_to_num(height_m, nan=0.0)
-        self._resolution_m = resolution_m
-        self._pad = math.ceil(_AROUND_M / resolution_m)
+    def __init__(self, labels: npt.NDArray[np.integer], heightmap: Heightmap) -> None:
+        self._height_m = heightmap.filled()
+        self._seen = np.isfinite(heightmap.height_m)
+        self._resolution_m = heightmap.workspace.resolution_m
+        self._pad = math.ceil(_AROUND_M / self._resolution_m)
         boxes = find_objects(labels)
         self._cells = {i: (box, labels[box] == i) for i, box in enumerate(boxes, start=1) if box is not None}
         self._alone = {i: np.where(own, self._height_m[box], np.float32(0)) for i, (box, own) in self._cells.items()}
@@ -190,7 +193,8 @@ class Foresight:
     def _prism(self, label: int) -> Prism | None:
         box, own = self._cells[label]
         height_m = upper_height(self._height_m[box][own], 90)
-        return Prism.of(own, (box[0].start, box[1].start), height_m, self._resolution_m)
+        solid = _without_specks(own, self._seen[box], self._resolution_m)
+        return Prism.of(solid, (box[0].start, box[1].start), height_m, self._resolution_m)
 
     def _may_be_lost(self, prism: Prism, move: Array) -> bool:
         middle = move[:2, :2] @ prism.center + move[:2, 2]
@@ -204,6 +208,17 @@ class Foresight:
         """Distance [m] of x and y (..., 2) from the rim of the map, negative beyond it."""
         size = np.array(self._height_m.shape[::-1]) * self._resolution_m
         return float(min(places.min(), (size - places).min()))
+
+
+def _without_specks(
+    own: npt.NDArray[np.bool_], seen: npt.NDArray[np.bool_], resolution_m: float
+) -> npt.NDArray[np.bool_]:
+    """Cells (h, w) of an object without the specks that the camera sees of it in the shadow behind it."""
+    size = 2 * round(_SPECKS_M / resolution_m / 2) + 1
+    share = cv2.boxFilter((own & seen).astype(np.float32), -1, (size, size), borderType=cv2.BORDER_CONSTANT)
+    dense = own & (share > 0.5)
+    # What is narrow all over has no inside.
+    return dense if 4 * np.count_nonzero(dense) > np.count_nonzero(own) else own
 
 
 def _inverse(move: Array) -> Array:

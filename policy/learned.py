@@ -154,10 +154,8 @@ class LearnedPolicy:
         heightmap = observation.heightmap
         resolution_m = heightmap.workspace.resolution_m
         free = free_to_descend(height_m, heightmap.workspace)
-        foresight = Foresight(observation.labels, height_m, resolution_m)
-        prospects = Prospects(
-            self._inference, foresight, observation.labels, height_m, heightmap.color, self._jaw, resolution_m
-        )
+        foresight = Foresight(observation.labels, heightmap)
+        prospects = Prospects(self._inference, foresight, observation.labels, heightmap, self._jaw)
         if observation.goal is None:
             middle = middles(observation.labels)
         else:

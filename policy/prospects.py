@@ -17,6 +17,7 @@ from policy.selection import Cells, best_cells, check_maps, faded, thinned
 if TYPE_CHECKING:
     from policy.foresight import Foresight
     from policy.inference import Inference
+    from robotcell.heightmap import Heightmap
 
 # Of an object that stood alone, so many grasps are looked at, on cells so far apart; the best of those that have room
 # after a push count. One grasp may find room by an error of the played push, so many do not.
@@ -39,10 +40,8 @@ class Prospects:
         inference: the network.
         foresight: of the view.
         labels: (H, W) the object in each cell, 0 for none.
-        height_m: (H, W) with closed gaps, NaN where nothing was seen.
-        color: (H, W, 3) uint8 RGB.
+        heightmap: what is seen.
         jaw: of the gripper.
-        resolution_m: size of a cell.
     """
 
     def __init__(
@@ -50,18 +49,14 @@ class Prospects:
         inference: Inference,
         foresight: Foresight,
         labels: npt.NDArray[np.integer],
-        height_m: npt.NDArray[np.float32],
-        color: npt.NDArray[np.uint8],
+        heightmap: Heightmap,
         jaw: Jaw,
-        resolution_m: float,
     ) -> None:
         self._inference = inference
         self._foresight = foresight
         self._labels = labels
-        self._height_m = height_m
-        self._color = color
+        self._heightmap = heightmap
         self._jaw = jaw
-        self._resolution_m = resolution_m
         self._objects: dict[int, _Alone] = {}
 
     def after(self, label: int, around: npt.NDArray[np.float32]) -> float:
@@ -81,11 +76,11 @@ class Prospects:
     def _alone(self, label: int) -> _Alone:
         """An object as if all others were gone."""
         if label not in self._objects:
-            own = self._labels == label
-            bare = np.where(own, np.nan_to_num(self._height_m), np.float32(0))
+            own, seen = self._labels == label, self._heightmap.color
+            bare = np.where(own, self._heightmap.filled(), np.float32(0))
             table = self._labels == 0
-            color = np.median(self._color[table], axis=0) if table.any() else np.zeros(3)
-            planes = encode(bare, np.where(own[..., None], self._color, color.astype(np.uint8)))
+            color = np.median(seen[table], axis=0) if table.any() else np.zeros(3)
+            planes = encode(bare, np.where(own[..., None], seen, color.astype(np.uint8)))
             q = self._inference.maps(planes, own, GRASP)
             check_maps(q, own, "grasp")
             best = best_cells(faded(q, own), thinned(own, _APART), _GRASPS)
@@ -98,7 +93,7 @@ class Prospects:
                 top_m=np.asarray(cv2.medianBlur(height_m, 5), np.float32),
                 owner=window.own.astype(np.int32),
                 pad=0,
-                resolution_m=self._resolution_m,
+                resolution_m=self._heightmap.workspace.resolution_m,
             )
             self._objects[label] = _Alone(grasps, surface)
         return self._objects[label]

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from robotcell.geometry import Array
 
 _GRAVITY_M_S2 = 9.81
-# Wood on a mat, on wood and on rubber; about the middle of what training draws.
-_TABLE_FRICTION = 0.6
-_OBJECT_FRICTION = 0.6
-_FINGER_FRICTION = 0.8
+# Of painted wood, of rubber on it, and of the table under it (assumed, as the twin does); those of two objects that
+# touch are multiplied.
+_OBJECT_FRICTION = 0.8
+_FINGER_FRICTION = 1.0
+_TABLE_FRICTION = 0.48
 # Share of the radius at which friction acts against turning: two thirds for a disc that only turns, less for what
 # slides as well. Set by comparing plays with the twin.
-_LEVER = 0.3
+_LEVER = 0.4
 # Twice as fast as the arm: friction of the table makes the outcome depend on the way alone.
 _SPEED_M_S = 0.16
 # Half as long a step tells pushes that help apart no better.
@@ -42,6 +43,12 @@ _CONVEX = 0.82
 _LEAST_PART_CELLS = 9
 # An object of fewer cells is noise.
 _LEAST_CELLS = 12
+# Above the tips, the closed fingers hang on cranks that stand out farther: from this height on, and so far from the
+# middle (public RG2 models: pivots 17 mm off the middle and 126 mm from the flange, 10 mm thick).
+_CRANKS_ABOVE_TIPS_M = linkage.CLOSED_LENGTH_M - 0.126 - linkage.CRANK_LENGTH_M
+_CRANKS_M = 0.020
+# Which of the shapes meet: objects each other, and what is high enough the tips and the cranks.
+_OBJECT, _REACHES_TIPS, _REACHES_CRANKS = 0b001, 0b010, 0b100
 # Objects so far behind the start or beyond the end of a push, and to its sides no farther than it is long, take part.
 _BEYOND_M = 0.10
 
@@ -77,10 +84,11 @@ class Prism:
 
 
 class _Slider(NamedTuple):
-    """A prism's body, and its shapes and joints."""
+    """A prism's body, its shapes, and the joints that are its friction on the table."""
 
     body: pymunk.Body
-    parts: tuple[pymunk.Shape | pymunk.Constraint, ...]
+    shapes: tuple[pymunk.Shape, ...]
+    joints: tuple[pymunk.Constraint, ...]
 
 
 class SlidingTable:
@@ -99,8 +107,10 @@ class SlidingTable:
         # To make bodies takes longer than a push: they are made once, and belong to a space while they take part.
         self._sliders = [_slider(self._ground, prism) for prism in prisms.values()]
         self._fingers = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        self._tips = pymunk.Poly.create_box(self._fingers, (2 * linkage.FINGER_THICKNESS_M, linkage.FINGER_BREADTH_M))
-        self._tips.friction = _FINGER_FRICTION
+        self._gripper = (
+            _fingers_shape(self._fingers, linkage.FINGER_THICKNESS_M, _REACHES_TIPS),
+            _fingers_shape(self._fingers, _CRANKS_M, _REACHES_CRANKS),
+        )
 
     def push(self, start: Array, theta: float, length_m: float, tip_m: float) -> dict[int, Array]:
         """Move the closed fingers along a line; returns the move of each object that moved, by label.
@@ -124,18 +134,22 @@ class SlidingTable:
         # A space of its own for every push: joints remember what they held in the last step of their space.
         space = pymunk.Space()
         space.collision_slop, space.collision_bias = _OVERLAP_M, _LEFT_OVERLAP
-        space.add(self._ground, self._fingers, self._tips)
+        space.add(self._ground, self._fingers, *self._gripper)
         for i in taking_part:
-            body = self._sliders[i].body
+            body, shapes = self._sliders[i].body, self._sliders[i].shapes
+            reaches = _REACHES_TIPS * bool(self._heights[i] > tip_m)
+            reaches |= _REACHES_CRANKS * bool(self._heights[i] > tip_m + _CRANKS_ABOVE_TIPS_M)
+            for shape in shapes:
+                shape.filter = pymunk.ShapeFilter(categories=_OBJECT | reaches)
             body.position, body.angle = tuple(self._centers[i].tolist()), 0.0
             body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
-            space.add(body, *self._sliders[i].parts)
+            space.add(body, *shapes, *self._sliders[i].joints)
         for _ in range(steps - idle):
             space.step(_STEP_S)
         moves = {self._labels[i]: move for i in taking_part if (move := self._move(i)) is not None}
-        space.remove(self._ground, self._fingers, self._tips)
+        space.remove(self._ground, self._fingers, *self._gripper)
         for i in taking_part:
-            space.remove(*self._sliders[i].parts)
+            space.remove(*self._sliders[i].shapes, *self._sliders[i].joints)
         # Uses up what the last step left to each body against its overlaps.
         space.step(_STEP_S)
         for i in taking_part:
@@ -146,9 +160,9 @@ class SlidingTable:
         """Indices of the objects that may take part, and how far the fingers go before they can meet one."""
         rel = self._centers - start
         ahead, aside = rel @ along, np.abs(rel @ np.array([-along[1], along[0]]))
-        part = (ahead > -_BEYOND_M) & (ahead < 2 * length_m + _BEYOND_M) & (aside < length_m) & (self._heights > tip_m)
-        fingers = math.hypot(linkage.FINGER_THICKNESS_M, linkage.FINGER_BREADTH_M / 2) + _OVERLAP_M
-        met = part & (aside < self._reaches + fingers)
+        part = (ahead > -_BEYOND_M) & (ahead < 2 * length_m + _BEYOND_M) & (aside < length_m)
+        fingers = math.hypot(_CRANKS_M, linkage.FINGER_BREADTH_M / 2) + _OVERLAP_M
+        met = part & (aside < self._reaches + fingers) & (self._heights > tip_m)
         free_m = (ahead - self._reaches)[met].min() - fingers if met.any() else length_m
         return np.flatnonzero(part).tolist(), float(free_m)
 
@@ -158,6 +172,13 @@ class SlidingTable:
         if max(abs(at.x - x), abs(at.y - y)) <= _MOVED_M and abs(sin) <= _TURNED_RAD:
             return None
         return np.array([[cos, -sin, at.x - cos * x + sin * y], [sin, cos, at.y - sin * x - cos * y], [0.0, 0.0, 1.0]])
+
+
+def _fingers_shape(fingers: pymunk.Body, half_thickness_m: float, meets: int) -> pymunk.Shape:
+    shape = pymunk.Poly.create_box(fingers, (2 * half_thickness_m, linkage.FINGER_BREADTH_M))
+    shape.friction = _FINGER_FRICTION
+    shape.filter = pymunk.ShapeFilter(mask=meets)
+    return shape
 
 
 def _slider(ground: pymunk.Body, prism: Prism) -> _Slider:
@@ -176,7 +197,7 @@ def _slider(ground: pymunk.Body, prism: Prism) -> _Slider:
     drag.max_bias, drag.max_force = 0.0, weight
     twist = pymunk.GearJoint(ground, body, 0.0, 1.0)
     twist.max_bias, twist.max_force = 0.0, _LEVER * math.sqrt(sum(areas) / math.pi) * weight
-    return _Slider(body, (*shapes, drag, twist))
+    return _Slider(body, tuple(shapes), (drag, twist))
 
 
 def _convex_parts(own: npt.NDArray[np.uint8]) -> list[Array]:

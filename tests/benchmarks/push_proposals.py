@@ -27,7 +27,7 @@ from policy.weights import load_named
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.decision import ROTATIONS
-from robotcell.heightmap import close_gaps
+from robotcell.heightmap import Heightmap
 from robotcell.jobs import look
 from robotcell.perception import find_goal, segment
 from sim_twin.scenes import scene_names
@@ -45,11 +45,10 @@ JAW = Jaw(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
 
 
 class View(NamedTuple):
-    """Heights with closed gaps and labels (H, W), colours (H, W, 3), and the label of the goal."""
+    """What is seen, the object in each cell (H, W), and the label of the goal."""
 
-    height_m: npt.NDArray[np.float32]
+    heightmap: Heightmap
     labels: npt.NDArray[np.int32]
-    color: npt.NDArray[np.uint8]
     goal: int
 
 
@@ -62,7 +61,7 @@ def training(kind: str) -> Iterator[View]:
         state = env.state
         if state.occupied:
             goal = max(state.occupied, key=lambda label: state.occupied[label])
-            yield View(state.height_m, state.labels.astype(np.int32), state.heightmap.color, goal)
+            yield View(state.heightmap, state.labels.astype(np.int32), goal)
     env.close()
 
 
@@ -75,18 +74,19 @@ def challenging() -> Iterator[View]:
         with open_cell(config) as cell:
             heightmap = look(cell).heightmap
         seen = segment(heightmap)
-        yield View(close_gaps(heightmap.height_m), seen.labels, heightmap.color, find_goal(seen, "red").label)
+        yield View(heightmap, seen.labels, find_goal(seen, "red").label)
 
 
 def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict[str, list[float]]:
     """What pushes promise, by the way they were chosen."""
-    height_m, labels, color, goal = view
+    heightmap, labels, goal = view
+    height_m = heightmap.closed_m
     targets = labels == goal
     mask = push_mask(targets, labels > 0)
     free = free_to_descend(height_m, CONFIG.workspace)
-    q = inference.maps(encode(height_m, color), mask, PUSH)
-    foresight = Foresight(labels, height_m, RESOLUTION_M)
-    prospects = Prospects(inference, foresight, labels, height_m, color, JAW, RESOLUTION_M)
+    q = inference.maps(encode(height_m, heightmap.color), mask, PUSH)
+    foresight = Foresight(labels, heightmap)
+    prospects = Prospects(inference, foresight, labels, heightmap, JAW)
 
     def promise(line, rotation):
         return prospects.after(goal, foresight.around(goal, foresight.play(line, rotation)))

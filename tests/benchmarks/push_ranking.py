@@ -77,8 +77,8 @@ class Ranking:
         labels, height_m, color = state.labels.astype(np.int32), state.height_m, state.heightmap.color
         mask = push_mask(labels == goal, labels > 0)
         q = self.inference.maps(encode(height_m, color), mask, PUSH)
-        foresight = Foresight(labels, height_m, RESOLUTION_M)
-        prospects = Prospects(self.inference, foresight, labels, height_m, color, JAW, RESOLUTION_M)
+        foresight = Foresight(labels, state.heightmap)
+        prospects = Prospects(self.inference, foresight, labels, state.heightmap, JAW)
         cells = rng.permutation(np.argwhere(mask))
         scores, graspable = defaultdict(list), []
         for row, col in cells.tolist():

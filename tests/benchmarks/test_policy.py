@@ -93,9 +93,9 @@ def test_play(benchmark, config, heightmap, inference):
     cells = np.argwhere(push_mask(observation.goal, observation.objects)).tolist()
     lines = (push_line(height_m, free, cell, 0, config.motion.push_m, resolution_m) for cell in cells)
     line = next(line for line in lines if line is not None)
-    foresight = Foresight(observation.labels, height_m, resolution_m)
+    foresight = Foresight(observation.labels, heightmap)
     jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
-    prospects = Prospects(inference, foresight, observation.labels, height_m, heightmap.color, jaw, resolution_m)
+    prospects = Prospects(inference, foresight, observation.labels, heightmap, jaw)
 
     def play():
         around = foresight.around(goal, foresight.play(line, 0))

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from policy.foresight import Foresight
 from policy.push_line import free_to_descend, push_line
 from robotcell.config import CellConfig
+from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
 RESOLUTION_M = CONFIG.workspace.resolution_m
@@ -30,7 +31,7 @@ class Table:
         free = free_to_descend(self.height_m, CONFIG.workspace)
         line = push_line(self.height_m, free, cell, rotation, PUSH_M, RESOLUTION_M)
         assert line is not None
-        foresight = Foresight(self.labels, self.height_m, RESOLUTION_M)
+        foresight = Foresight(self.labels, heightmap(self.height_m))
         return foresight, line, foresight.play(line, rotation)
 
 
@@ -76,10 +77,33 @@ def test_what_is_met_on_the_way_is_pushed_on():
 
 
 def test_fingers_pass_over_what_is_lower_than_their_tips():
-    table = Table((100, 60, 25, 25, 0.10), (100, 95, 25, 25, 0.03))
-    foresight, _, played = table.push((112, 72), 0)
-    assert set(played.moves) == {1}
-    assert freed(foresight, 1, played) < 0.1  # it stands over the low one now
+    # The low one lies beside the way of the high one and in that of the fingers.
+    table = Table((92, 60, 20, 25, 0.10), (112, 60, 25, 25, 0.03))
+    _, line, played = table.push((111, 72), 0)
+    assert line.top_m == pytest.approx(0.10)
+    assert played.moves[1][0, 2] > 0.05
+    assert 2 not in played.moves or abs(shift(played, 2, (124, 72))[0]) < 0.02
+
+
+def test_what_is_lower_than_the_tips_is_pushed_by_what_they_push():
+    _, _, played = Table((100, 60, 25, 25, 0.10), (100, 95, 25, 25, 0.03)).push((112, 72), 0)
+    first, second = shift(played, 1, (112, 72)), shift(played, 2, (112, 107))
+    assert 0.02 < second[0] < first[0]
+
+
+def test_specks_in_the_shadow_behind_an_object_are_not_pushed():
+    clear, specked = (Table((100, 60, 25, 25), (100, 135, 25, 25)) for _ in range(2))
+    # Between the two the camera sees little, and takes it for the first.
+    specked.height_m[100:125, 85:100] = np.nan
+    specked.height_m[100:125:4, 85:100:3], specked.labels[100:125, 85:100] = 0.03, 1
+    far = clear.push((112, 72), 0)[2]
+    assert set(far.moves) == {1}
+    np.testing.assert_allclose(specked.push((112, 72), 0)[2].moves[1], far.moves[1], atol=0.003)
+
+
+def test_what_is_narrow_is_an_obstacle_all_the_same():
+    _, _, played = Table((100, 60, 25, 25), (90, 95, 45, 2)).push((112, 72), 0)
+    assert set(played.moves) == {1, 2}
 
 
 def test_what_stands_in_the_mouth_of_another_is_not_driven_out():

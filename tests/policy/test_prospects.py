@@ -1,5 +1,7 @@
 """What a push promises."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from policy.network import GRASP
 from policy.prospects import Prospects
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
+from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
 RESOLUTION_M = CONFIG.workspace.resolution_m
@@ -44,8 +47,9 @@ class View:
             height_m[place], labels[place] = 0.05, label
         color = np.full((*labels.shape, 3), 90, np.uint8)
         color[labels > 0] = 200, 40, 40
-        self.foresight = Foresight(labels, height_m, RESOLUTION_M)
-        self.prospects = Prospects(self.network, self.foresight, labels, height_m, color, JAW, RESOLUTION_M)
+        view = replace(heightmap(height_m), color=color)
+        self.foresight = Foresight(labels, view)
+        self.prospects = Prospects(self.network, self.foresight, labels, view, JAW)
 
     def promise(self, label=1, played=STAYS):
         return self.prospects.after(label, self.foresight.around(label, played))

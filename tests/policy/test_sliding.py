@@ -77,6 +77,15 @@ def test_what_is_lower_than_the_tips_stays():
     assert pushed(SlidingTable({1: prism((60, 60, 25, 25))}), (0.08, 0.145), 0.0).keys() == {1}
 
 
+def test_what_is_high_is_met_by_the_cranks_above_the_fingers():
+    low, high = (
+        pushed(SlidingTable({1: prism((60, 60, 25, 25), height_m=height_m)}), (0.08, 0.145), 0.0)[1][0, 2]
+        for height_m in (0.04, 0.10)
+    )
+    # They stand out 10 mm farther.
+    assert high - low == pytest.approx(0.010, abs=0.002)
+
+
 def test_an_empty_table_can_be_pushed_over():
     assert pushed(SlidingTable({}), (0.1, 0.1), 1.0) == {}
 
