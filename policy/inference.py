@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,16 +54,16 @@ class Inference:
 
         Args:
             planes: (5, H, W) encoded heightmap.
-            cells: (H, W) that are asked for, at least one.
+            cells: (H, W) that are asked for in all rotations, or (K, H, W) in each; at least one.
             primitive: `GRASP` or `PUSH`.
         """
         rotations = _PLANES[primitive]
         copies = Copies.around(cells, range(rotations), MARGIN)
         x = torch.from_numpy(copies.turn(planes))
-        at_once = max(1, _CELLS_AT_ONCE // copies.side**2)
+        at_once = max(1, _CELLS_AT_ONCE // math.prod(copies.shape))
         with torch.inference_mode(), autocast(x.device):
             q = torch.cat([self._network(x[i : i + at_once])[:, primitive] for i in range(0, rotations, at_once)])
-        maps = np.full((rotations, *cells.shape), np.nan, np.float32)
+        maps = np.full((rotations, *cells.shape[-2:]), np.nan, np.float32)
         maps[:, copies.rows, copies.cols] = copies.values(q.float().numpy())
         return maps
 

@@ -45,37 +45,52 @@ class Copies:
     """Rotated copies around some cells of a map.
 
     Attributes:
-        side: of each copy [cells].
-        matrices: (K, 2, 3), see `turn_matrix`.
         rows: (N,) of the cells.
         cols: (N,) of the cells.
+        asked: (K, N) which of them each copy is made for.
+        matrices: (K, 2, 3), see `turn_matrix`.
+        shape: rows and columns of each copy.
     """
 
-    side: int
-    matrices: Array
     rows: npt.NDArray[np.intp]
     cols: npt.NDArray[np.intp]
+    asked: npt.NDArray[np.bool_]
+    matrices: Array
+    shape: tuple[int, int]
 
     @staticmethod
     def around(cells: npt.NDArray[np.bool_], rotations: range, margin: int) -> Copies:
-        """Copies that show all the cells of a mask (H, W), which is not empty, and `margin` cells around them."""
-        rows, cols = np.nonzero(cells)
-        # Whole cells: so quarter turns bring cells onto cells.
-        center = (int(rows.min() + rows.max()) // 2, int(cols.min() + cols.max()) // 2)
-        turns = np.stack([turn_matrix(k, center, (0.0, 0.0)) for k in rotations])
-        reach = np.abs(turns @ np.stack([cols, rows, np.ones(len(rows))])).max() + margin
-        side = math.ceil(2 * reach / _MULTIPLE) * _MULTIPLE
-        turns[:, :, 2] += side / 2
-        return Copies(side, turns, rows, cols)
+        """Copies that show all the cells of a mask and `margin` cells around them.
+
+        Args:
+            cells: (H, W) for all rotations, or (K, H, W) for each; not empty.
+            rotations: the K of them.
+            margin: in cells.
+        """
+        each = np.broadcast_to(cells, (len(rotations), *cells.shape[-2:]))
+        rows, cols = np.nonzero(cells if cells.ndim == 2 else cells.any(axis=0))
+        asked = each[:, rows, cols]
+        # Whole cells, here and below: so quarter turns bring cells onto cells.
+        middle = (int(rows.min() + rows.max()) // 2, int(cols.min() + cols.max()) // 2)
+        turns = np.stack([turn_matrix(k, middle, (0.0, 0.0)) for k in rotations])
+        places = turns @ np.stack([cols, rows, np.ones(len(rows))])
+        low = np.where(asked[:, None], places, np.inf).min(axis=2)
+        high = np.where(asked[:, None], places, -np.inf).max(axis=2)
+        # A copy that nothing is asked of shows anything.
+        low, high = np.nan_to_num(low, posinf=0.0), np.nan_to_num(high, neginf=0.0)
+        center = np.rint((low + high) / 2)
+        reach = np.maximum(high - center, center - low).max(axis=0) + margin
+        width, height = (np.ceil(2 * reach / _MULTIPLE).astype(int) * _MULTIPLE).tolist()
+        turns[:, :, 2] += np.array([width, height]) / 2 - center
+        return Copies(rows, cols, asked, turns, (height, width))
 
     def turn(self, planes: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """(K, C, side, side) copies of planes (C, H, W), 0 where the map does not reach; in memory, channels come last.
+        """(K, C, rows, columns) copies of planes (C, H, W), 0 where the map does not reach.
 
-        That is how convolutions want them.
+        In memory, channels come last: that is how convolutions want them.
         """
-        image = np.ascontiguousarray(np.moveaxis(planes, 0, 2))
-        size = (self.side, self.side)
-        turned = np.empty((len(self.matrices), *size, len(planes)), np.float32)
+        image, size = np.ascontiguousarray(np.moveaxis(planes, 0, 2)), self.shape[::-1]
+        turned = np.empty((len(self.matrices), *self.shape, len(planes)), np.float32)
         for M, copy in zip(self.matrices, turned, strict=True):
             cv2.warpAffine(
                 image, M, size, dst=copy, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
@@ -83,8 +98,9 @@ class Copies:
         return np.moveaxis(turned, 3, 1)
 
     def values(self, maps: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """(K, N) of maps (K, side, side) at the cells."""
+        """(K, N) of maps (K, rows, columns) at the cells; NaN where they were not asked for."""
         places = self.matrices @ np.stack([self.cols, self.rows, np.ones(len(self.rows))])
-        col, row = np.rint(places).astype(np.intp).clip(0, self.side - 1).swapaxes(0, 1)
-        values: npt.NDArray[np.float32] = maps[np.arange(len(maps))[:, None], row, col]
-        return values
+        col, row = np.rint(places).astype(np.intp).swapaxes(0, 1)
+        height, width = self.shape
+        found = maps[np.arange(len(maps))[:, None], row.clip(0, height - 1), col.clip(0, width - 1)]
+        return np.asarray(np.where(self.asked, found, np.nan), np.float32)

@@ -38,12 +38,12 @@ _FLAT = 1e-6
 
 
 def check_maps(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], name: str) -> None:
-    """Refuse Q maps (K, H, W) that no action can be read from inside a mask (H, W).
+    """Refuse Q maps (K, H, W) that no action can be read from inside a mask (H, W) or (K, H, W).
 
     Raises:
         ConfigError: they are empty, not finite, or the same everywhere.
     """
-    values = q[:, mask]
+    values = q[np.broadcast_to(mask, q.shape)]
     if not values.size:
         problem = f"are empty, of shape {q.shape} with {np.count_nonzero(mask)} cells asked for"
     elif not np.isfinite(values).all():
@@ -95,6 +95,25 @@ def thinned(mask: npt.NDArray[np.bool_], apart: int) -> npt.NDArray[np.bool_]:
     return lattice if lattice.any() else mask
 
 
+def through_middles(
+    mask: npt.NDArray[np.bool_], middle: npt.NDArray[np.float64], rotations: int, beside: int
+) -> npt.NDArray[np.bool_]:
+    """(K, H, W) cells whose pushes pass near the middle of what they are to free.
+
+    Args:
+        mask: (H, W) cells that may be pushed through.
+        middle: (H, W, 2) row and column of the middle of what a push through the cell is to free.
+        rotations: K.
+        beside: no farther beside it than this [cells].
+    """
+    rows, cols = np.nonzero(mask)
+    away = np.stack([rows, cols], axis=-1) - middle[rows, cols]
+    normals = np.stack([normal(k) for k in range(rotations)])
+    near = np.zeros((rotations, *mask.shape), np.bool_)
+    near[:, rows, cols] = np.abs(normals @ away.T) <= beside
+    return near
+
+
 class Candidate(NamedTuple):
     """A push that may be chosen: rotation, cell of the push map, its Q, and the way of the fingers."""
 
@@ -123,11 +142,11 @@ def pushes(
     resolution_m: float,
     lanes: int,
 ) -> Iterator[Candidate]:
-    """Of each rotation, the best pushes through cells of a mask (H, W) that have a place to begin, side by side.
+    """Of each rotation, the best pushes through cells of a mask that have a place to begin, side by side.
 
     Args:
         q: (K, H, W) Q maps.
-        mask: (H, W) cells that may be pushed through.
+        mask: (K, H, W) cells that may be pushed through.
         middle: (H, W, 2) row and column of the middle of what a push through the cell is to free.
         height_m: (H, W) with closed gaps.
         free: (H, W) cells where the fingers may come down.
@@ -135,12 +154,13 @@ def pushes(
         resolution_m: size of a cell.
         lanes: at most so many of a rotation.
     """
-    cells = np.argwhere(thinned(mask, _APART))
-    values = q[:, cells[:, 0], cells[:, 1]]
+    cells = np.argwhere(thinned(np.logical_or.reduce(mask), _APART))
+    values, allowed = q[:, cells[:, 0], cells[:, 1]], mask[:, cells[:, 0], cells[:, 1]]
     beside = cells - middle[cells[:, 0], cells[:, 1]]
     for k in range(len(q)):
         aside = beside @ normal(k)
-        order = np.argsort(_BESIDE * np.abs(aside) - values[k], kind="stable")[:_PUSH_TRIES]
+        order = np.argsort(_BESIDE * np.abs(aside) - values[k], kind="stable")
+        order = order[allowed[k, order]][:_PUSH_TRIES]
         taken: set[int] = set()
         for i, start in _starting(free, cells, order, k, push_m, resolution_m):
             if (lane := round(aside[i] / _LANE)) in taken:

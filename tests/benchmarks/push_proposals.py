@@ -92,7 +92,7 @@ def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict
         return prospects.after(goal, foresight.around(goal, foresight.play(line, rotation)))
 
     def proposed(middle):
-        chosen = pushes(q, mask, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
+        chosen = pushes(q, np.broadcast_to(mask, q.shape), middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
         return [promise(push.line, push.rotation) for push in chosen]
 
     cells = np.argwhere(mask)

@@ -23,7 +23,7 @@ class Maps:
         self.push = np.zeros((16, 224, 224), np.float32)
         # No map of a network is flat.
         for place in (GOAL, OTHER):
-            self.grasp[0][place][0, 0] = self.push[0][place][0, 0] = 0.01
+            self.grasp[0][place][0, 0] = self.push[0][place][12, 12] = 0.01
 
     def maps(self, planes, cells, primitive):
         assert planes.shape == (5, 224, 224)

@@ -27,7 +27,7 @@ def test_the_values_of_turned_planes_are_those_of_the_cells(mask, margin):
     rows, cols = np.nonzero(mask)
     planes = np.indices(mask.shape).astype(np.float32)
     turned = copies.turn(planes)
-    assert turned.shape == (ROTATIONS, 2, copies.side, copies.side)
+    assert turned.shape == (ROTATIONS, 2, *copies.shape)
     row, col = copies.values(turned[:, 0]), copies.values(turned[:, 1])
     # Between quarter turns, the nearest cell of the copy may show a neighbour (or what is beyond the map: 0).
     inside = (rows > 0) & (rows < ROWS - 1) & (cols > 0) & (cols < COLS - 1)
@@ -40,11 +40,33 @@ def test_the_values_of_turned_planes_are_those_of_the_cells(mask, margin):
 @given(MASKS, st.integers(0, 30), st.integers(0, ROTATIONS - 1), st.integers(1, ROTATIONS))
 def test_every_cell_has_its_margin(mask, margin, first, count):
     copies = Copies.around(mask, range(first, first + count), margin)
-    assert copies.side % 16 == 0
+    rows, cols = copies.shape
+    assert rows % 16 == cols % 16 == 0
     assert len(copies.matrices) == count
     at = places(copies)
     assert at.min() > margin - 1e-9
-    assert at.max() < copies.side - margin + 1e-9
+    assert (at.max(axis=(0, 2)) < np.array([cols, rows]) - margin + 1e-9).all()
+
+
+@given(hnp.arrays(np.bool_, (ROTATIONS, ROWS, COLS)).filter(np.any))
+def test_each_rotation_may_be_asked_for_cells_of_its_own(masks):
+    copies = Copies.around(masks, range(ROTATIONS), 4)
+    shown = copies.turn(np.ones((1, ROWS, COLS), np.float32))
+    asked = masks[:, copies.rows, copies.cols]
+    values = copies.values(shown[:, 0])
+    np.testing.assert_array_equal(np.isfinite(values), asked)
+    inside = (copies.rows > 0) & (copies.rows < ROWS - 1) & (copies.cols > 0) & (copies.cols < COLS - 1)
+    assert (values[asked & inside] == 1).all()
+
+
+def test_copies_of_strips_are_low():
+    strips = np.zeros((ROTATIONS, 96, 96), np.bool_)
+    rows, cols = np.indices(strips.shape[1:]) - 48
+    for k in range(ROTATIONS):
+        theta = math.tau * k / ROTATIONS
+        strips[k] = np.abs(rows * math.cos(theta) - cols * math.sin(theta)) <= 6
+        strips[k] &= rows**2 + cols**2 < 40**2
+    assert Copies.around(strips, range(ROTATIONS), 8).shape == (32, 96)
 
 
 @given(st.integers(0, ROTATIONS - 1), st.tuples(st.integers(0, 50), st.integers(0, 50)), st.floats(-20, 20))

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from policy.push_line import free_to_descend
-from policy.selection import best_cells, check_maps, middles, push_mask, pushes, surface_at
+from policy.selection import best_cells, check_maps, middles, push_mask, pushes, surface_at, through_middles
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
 
@@ -100,7 +100,7 @@ BLOCK = np.s_[90:134, 90:134]
 MIDDLE = (111.5, 111.5)
 
 
-def proposed(q, *, wall=None, lanes=1):
+def proposed(q, *, wall=None, lanes=1, beside=99):
     """Pushes of a block of 88 x 88 mm in the middle of the table, with or without a wall."""
     height_m = np.zeros(CONFIG.workspace.shape, np.float32)
     height_m[BLOCK] = 0.05
@@ -110,7 +110,9 @@ def proposed(q, *, wall=None, lanes=1):
     free = free_to_descend(height_m, CONFIG.workspace)
     middle = np.broadcast_to(np.array(MIDDLE), (*height_m.shape, 2))
     maps = np.broadcast_to(q, (16, *height_m.shape)) * mask
-    return list(pushes(maps, mask, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes))
+    return list(
+        pushes(maps, through_middles(mask, middle, 16, beside), middle, height_m, free, PUSH_M, RESOLUTION_M, lanes)
+    )
 
 
 def test_where_all_pushes_are_worth_the_same_they_go_through_the_middle():
@@ -131,6 +133,26 @@ def test_a_better_push_farther_aside_is_taken_and_a_slightly_better_one_is_not()
     assert 95 <= aside.cell[0] < 100
     assert aside.q == pytest.approx(0.9)
     assert abs(through.cell[0] - MIDDLE[0]) < 3
+
+
+def test_no_push_is_looked_for_far_beside_the_middle():
+    much = np.full(CONFIG.workspace.shape, 0.3, np.float32)
+    much[95:100] = 0.9
+    (near,) = (push for push in proposed(much, beside=8) if push.rotation == 0)
+    assert abs(near.cell[0] - MIDDLE[0]) <= 8
+    assert near.q == pytest.approx(0.3)
+
+
+@given(hnp.arrays(np.bool_, (20, 30)), st.integers(0, 12), st.integers(0, 15))
+def test_cells_are_near_the_middle_beside_their_push(mask, beside, rotation):
+    middle = np.broadcast_to(np.array([9.0, 14.0]), (*mask.shape, 2))
+    near = through_middles(mask, middle, 16, beside)[rotation]
+    assert not near[~mask].any()
+    theta = rotation * np.pi / 8
+    rows, cols = np.nonzero(mask)
+    aside = np.abs((rows - 9) * np.cos(theta) - (cols - 14) * np.sin(theta))
+    clear = np.abs(aside - beside) > 1e-6
+    np.testing.assert_array_equal(near[rows, cols][clear], (aside <= beside)[clear])
 
 
 def test_a_direction_without_a_place_to_begin_has_no_push():
