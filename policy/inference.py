@@ -57,14 +57,15 @@ class Inference:
             cells: (H, W) that are asked for in all rotations, or (K, H, W) in each; at least one.
             primitive: `GRASP` or `PUSH`.
         """
-        rotations = _PLANES[primitive]
-        copies = Copies.around(cells, range(rotations), MARGIN)
+        each = np.broadcast_to(cells, (_PLANES[primitive], *cells.shape[-2:]))
+        rotations = np.flatnonzero(each.any(axis=(1, 2)))
+        copies = Copies.around(each[rotations], rotations.tolist(), MARGIN)
         x = torch.from_numpy(copies.turn(planes))
         at_once = max(1, _CELLS_AT_ONCE // math.prod(copies.shape))
         with torch.inference_mode(), autocast(x.device):
-            q = torch.cat([self._network(x[i : i + at_once])[:, primitive] for i in range(0, rotations, at_once)])
-        maps = np.full((rotations, *cells.shape[-2:]), np.nan, np.float32)
-        maps[:, copies.rows, copies.cols] = copies.values(q.float().numpy())
+            q = torch.cat([self._network(x[i : i + at_once])[:, primitive] for i in range(0, len(x), at_once)])
+        maps = np.full(each.shape, np.nan, np.float32)
+        maps[rotations[:, None], copies.rows, copies.cols] = copies.values(q.float().numpy())
         return maps
 
 

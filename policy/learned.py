@@ -12,7 +12,7 @@ import numpy.typing as npt
 from policy.encoding import encode
 from policy.foresight import Foresight
 from policy.grasping import Jaw, finger_reach, finger_room, lay_table
-from policy.network import GRASP, PUSH, PUSH_ROTATIONS
+from policy.network import GRASP, PUSH
 from policy.prospects import Prospects
 from policy.push_line import free_to_descend
 from policy.repeats import repeats
@@ -22,10 +22,10 @@ from policy.selection import (
     check_maps,
     faded,
     middles,
+    possible_pushes,
     push_mask,
     pushes,
     surface_at,
-    through_middles,
 )
 from policy.surface import cell_centers, estimate_surface
 from robotcell.decision import Action, Primitive
@@ -39,15 +39,13 @@ if TYPE_CHECKING:
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
 # the goal's mask is below a threshold).
 _GRASP_THRESHOLD = 0.6
-# Where no push near the targets has a place to begin, the mask and what is looked at beside their middle grow by the
-# same again, up to so many times in all.
+# Where no push near the targets has a place to begin, the mask grows by the same again, up to so many times in all.
 _PUSH_REACHES = 3
-# Pushes of a rotation that are played ahead; more where a goal is hidden, since it need not lie in the middle of what
-# hides it.
+# Pushes of a rotation that are played ahead, and how far beside the middle of what they are to free they are looked for
+# [cells]: the network is shown the less for it. More and anywhere where a goal is hidden, since it need not lie in the
+# middle of what hides it.
 _LANES, _LANES_TO_SEARCH = 1, 4
-# For each of them, pushes are looked for so far beside the middle of what they are to free [cells]: the network is
-# shown the less for it.
-_BESIDE = 8
+_BESIDE, _ANYWHERE = 8, 2**15
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
 # So many of the best grasps are looked at for whether the fingers come down beside what stands around. The network
@@ -176,17 +174,17 @@ class LearnedPolicy:
             middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
         # Under one of these a hidden goal is.
         wanted = set(np.unique(observation.labels[targets]).tolist()) if observation.goal is not None else None
-        lanes = _LANES if observation.may_grasp else _LANES_TO_SEARCH
+        lanes, beside = (_LANES, _BESIDE) if observation.may_grasp else (_LANES_TO_SEARCH, _ANYWHERE)
         mask = targets
-        for reach in range(1, _PUSH_REACHES + 1):
+        for _ in range(_PUSH_REACHES):
             mask = push_mask(mask | targets, observation.objects)
-            ways = through_middles(mask, middle, PUSH_ROTATIONS, reach * lanes * _BESIDE)
-            if not ways.any():
+            possible = possible_pushes(mask, middle, free, self._push_m, resolution_m, beside)
+            if not possible.any():
                 continue
-            q = self._inference.maps(planes, ways, PUSH)
-            check_maps(q, ways, "push")
+            q = self._inference.maps(planes, possible, PUSH)
+            check_maps(q, possible, "push")
             found: list[_Push] = []
-            for push in pushes(q, ways, middle, height_m, free, self._push_m, resolution_m, lanes):
+            for push in pushes(q, possible, middle, height_m, free, self._push_m, resolution_m, lanes):
                 x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
                 if not repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
                     aims = wanted or {int(observation.labels[push.cell])}

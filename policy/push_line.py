@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from robotcell import linkage
 from robotcell.decision import ROTATIONS
 from robotcell.perception import MIN_OBJECT_M
 
@@ -26,6 +28,10 @@ if TYPE_CHECKING:
 _FREE_RADIUS_M = 0.016
 # What stands higher than this is in their way.
 _FREE_HEIGHT_M = 0.008
+# Cranks and body of the gripper keep this distance from what they pass.
+_SIDE_MARGIN_M = 0.003
+# Where something is too high for them, the fingers come down so much farther back [cells].
+_STEPS_BACK = (0, 2, 4, 6)
 # The push must still go on for this far behind the cell that it was chosen for.
 _FOLLOW_M = 0.010
 # The height of what is met is taken over so much of its face: the first cells of an edge are uncertain.
@@ -93,17 +99,34 @@ def push_line(
 ) -> PushLine | None:
     """The push of length `push_m` in direction `rotation` through a cell; None where there is none."""
     row, col = push_starts(free, np.array([cell]), rotation, push_m, resolution_m)[0]
-    return None if row < 0 else line_from(height_m, (int(row), int(col)), rotation, push_m, resolution_m)
+    return None if row < 0 else line_from(height_m, free, (int(row), int(col)), rotation, push_m, resolution_m)
 
 
 def line_from(
     height_m: npt.NDArray[np.float32],
+    free: npt.NDArray[np.bool_],
     start: tuple[int, int],
     rotation: int,
     push_m: float,
     resolution_m: float,
 ) -> PushLine | None:
-    """The push from a start on; None where it meets nothing."""
+    """The push from a free start on, or from a little farther back, where what stands around it is not too high.
+
+    None where there is no such place, or where the push meets nothing.
+    """
+    for back in _STEPS_BACK:
+        row, col = np.rint(start - back * _direction(rotation)).astype(np.intp).tolist()
+        if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1] and free[row, col]):
+            return None
+        line = _line((row, col), height_m, rotation, push_m, resolution_m)
+        if line is None or not _gripper_touches(height_m, line, rotation, resolution_m):
+            return line
+    return None
+
+
+def _line(
+    start: tuple[int, int], height_m: npt.NDArray[np.float32], rotation: int, push_m: float, resolution_m: float
+) -> PushLine | None:
     length = round(push_m / resolution_m)
     way = np.rint(np.array(start)[:, None] + _direction(rotation)[:, None] * np.arange(length + 1)).astype(np.intp)
     outside = np.flatnonzero(((way < 0) | (way >= np.array(height_m.shape)[:, None])).any(axis=0))
@@ -114,6 +137,30 @@ def line_from(
         return None
     face = profile[met[0] : met[0] + round(_FACE_M / resolution_m)]
     return PushLine(start[0], start[1], float(face.max()), cells)
+
+
+def _gripper_touches(height_m: npt.NDArray[np.float32], line: PushLine, rotation: int, resolution_m: float) -> bool:
+    """Whether something around a start reaches up to the gripper above the tips of its closed fingers."""
+    tip_m = line.top_m / 2
+    for part, above_m in (
+        (linkage.CRANKS_M, linkage.CRANKS_ABOVE_TIPS_M),
+        (linkage.BODY_M, linkage.BODY_ABOVE_TIPS_M),
+    ):
+        cells = np.array([[line.row], [line.col]]) + _beneath(part, rotation, resolution_m)
+        row, col = cells[:, ((cells >= 0) & (cells < np.array(height_m.shape)[:, None])).all(axis=0)]
+        if (height_m[row, col] > tip_m + above_m).any():
+            return True
+    return False
+
+
+@lru_cache(maxsize=64)
+def _beneath(half_m: tuple[float, float], rotation: int, resolution_m: float) -> npt.NDArray[np.intp]:
+    """(2, N) rows and columns, from the middle, of the cells beneath a rectangle that runs along a direction."""
+    half = (np.array(half_m) + _SIDE_MARGIN_M) / resolution_m
+    reach = math.ceil(np.hypot(*half))
+    cells = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1)
+    along, across = _direction(rotation) @ cells, normal(rotation) @ cells
+    return np.asarray(cells[:, (np.abs(along) <= half[0]) & (np.abs(across) <= half[1])])
 
 
 def normal(rotation: int) -> Array:

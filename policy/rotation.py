@@ -17,6 +17,8 @@ import numpy.typing as npt
 from robotcell.decision import ROTATIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from robotcell.geometry import Array
 
 # How far around its cell a Q value depends on what stands there [cells]: the fingers' reach, and what a push meets
@@ -59,11 +61,11 @@ class Copies:
     shape: tuple[int, int]
 
     @staticmethod
-    def around(cells: npt.NDArray[np.bool_], rotations: range, margin: int) -> Copies:
+    def around(cells: npt.NDArray[np.bool_], rotations: Sequence[int], margin: int) -> Copies:
         """Copies that show all the cells of a mask and `margin` cells around them.
 
         Args:
-            cells: (H, W) for all rotations, or (K, H, W) for each; not empty.
+            cells: (H, W) for all rotations, or (K, H, W) for each; some for each of them.
             rotations: the K of them.
             margin: in cells.
         """
@@ -76,8 +78,6 @@ class Copies:
         places = turns @ np.stack([cols, rows, np.ones(len(rows))])
         low = np.where(asked[:, None], places, np.inf).min(axis=2)
         high = np.where(asked[:, None], places, -np.inf).max(axis=2)
-        # A copy that nothing is asked of shows anything.
-        low, high = np.nan_to_num(low, posinf=0.0), np.nan_to_num(high, neginf=0.0)
         center = np.rint((low + high) / 2)
         reach = np.maximum(high - center, center - low).max(axis=0) + margin
         width, height = (np.ceil(2 * reach / _MULTIPLE).astype(int) * _MULTIPLE).tolist()

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.push_line import PushLine, line_from, normal, push_starts
+from robotcell.decision import ROTATIONS
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -95,23 +96,37 @@ def thinned(mask: npt.NDArray[np.bool_], apart: int) -> npt.NDArray[np.bool_]:
     return lattice if lattice.any() else mask
 
 
-def through_middles(
-    mask: npt.NDArray[np.bool_], middle: npt.NDArray[np.float64], rotations: int, beside: int
+def possible_pushes(
+    mask: npt.NDArray[np.bool_],
+    middle: npt.NDArray[np.float64],
+    free: npt.NDArray[np.bool_],
+    push_m: float,
+    resolution_m: float,
+    beside: int,
 ) -> npt.NDArray[np.bool_]:
-    """(K, H, W) cells whose pushes pass near the middle of what they are to free.
+    """(K, H, W) cells, some apart, through which pushes can be made near the middle of what they are to free.
 
     Args:
         mask: (H, W) cells that may be pushed through.
         middle: (H, W, 2) row and column of the middle of what a push through the cell is to free.
-        rotations: K.
-        beside: no farther beside it than this [cells].
+        free: (H, W) cells where the fingers may come down.
+        push_m: length of a push.
+        resolution_m: size of a cell.
+        beside: no farther beside the middle than this [cells], or than the nearest that has a place to begin.
     """
-    rows, cols = np.nonzero(mask)
-    away = np.stack([rows, cols], axis=-1) - middle[rows, cols]
-    normals = np.stack([normal(k) for k in range(rotations)])
-    near = np.zeros((rotations, *mask.shape), np.bool_)
-    near[:, rows, cols] = np.abs(normals @ away.T) <= beside
-    return near
+    cells = np.argwhere(thinned(mask, _APART))
+    away = cells - middle[cells[:, 0], cells[:, 1]]
+    possible = np.zeros((ROTATIONS, *mask.shape), np.bool_)
+    for k in range(ROTATIONS):
+        aside = np.abs(away @ normal(k))
+        for near in (aside <= beside, aside > beside):
+            some = cells[near]
+            begins = push_starts(free, some, k, push_m, resolution_m)[:, 0] >= 0
+            if begins.any():
+                begins &= aside[near] <= max(beside, aside[near][begins].min() + beside)
+                possible[k, some[begins, 0], some[begins, 1]] = True
+                break
+    return possible
 
 
 class Candidate(NamedTuple):
@@ -134,7 +149,7 @@ def middles(labels: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
 
 def pushes(
     q: npt.NDArray[np.float32],
-    mask: npt.NDArray[np.bool_],
+    possible: npt.NDArray[np.bool_],
     middle: npt.NDArray[np.float64],
     height_m: npt.NDArray[np.float32],
     free: npt.NDArray[np.bool_],
@@ -142,11 +157,11 @@ def pushes(
     resolution_m: float,
     lanes: int,
 ) -> Iterator[Candidate]:
-    """Of each rotation, the best pushes through cells of a mask that have a place to begin, side by side.
+    """Of each rotation, the best of the pushes that are possible, side by side.
 
     Args:
         q: (K, H, W) Q maps.
-        mask: (K, H, W) cells that may be pushed through.
+        possible: (K, H, W) cells that pushes are made through, see `possible_pushes`.
         middle: (H, W, 2) row and column of the middle of what a push through the cell is to free.
         height_m: (H, W) with closed gaps.
         free: (H, W) cells where the fingers may come down.
@@ -154,8 +169,8 @@ def pushes(
         resolution_m: size of a cell.
         lanes: at most so many of a rotation.
     """
-    cells = np.argwhere(thinned(np.logical_or.reduce(mask), _APART))
-    values, allowed = q[:, cells[:, 0], cells[:, 1]], mask[:, cells[:, 0], cells[:, 1]]
+    cells = np.argwhere(np.logical_or.reduce(possible))
+    values, allowed = q[:, cells[:, 0], cells[:, 1]], possible[:, cells[:, 0], cells[:, 1]]
     beside = cells - middle[cells[:, 0], cells[:, 1]]
     for k in range(len(q)):
         aside = beside @ normal(k)
@@ -165,7 +180,7 @@ def pushes(
         for i, start in _starting(free, cells, order, k, push_m, resolution_m):
             if (lane := round(aside[i] / _LANE)) in taken:
                 continue
-            line = line_from(height_m, start, k, push_m, resolution_m)
+            line = line_from(height_m, free, start, k, push_m, resolution_m)
             if line is None:
                 continue
             yield Candidate(k, (int(cells[i, 0]), int(cells[i, 1])), float(values[k, i]), line)

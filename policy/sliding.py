@@ -43,10 +43,6 @@ _CONVEX = 0.82
 _LEAST_PART_CELLS = 9
 # An object of fewer cells is noise.
 _LEAST_CELLS = 12
-# Above the tips, the closed fingers hang on cranks that stand out farther: from this height on, and so far from the
-# middle (public RG2 models: pivots 17 mm off the middle and 126 mm from the flange, 10 mm thick).
-_CRANKS_ABOVE_TIPS_M = linkage.CLOSED_LENGTH_M - 0.126 - linkage.CRANK_LENGTH_M
-_CRANKS_M = 0.020
 # Which of the shapes meet: objects each other, and what is high enough the tips and the cranks.
 _OBJECT, _REACHES_TIPS, _REACHES_CRANKS = 0b001, 0b010, 0b100
 # Objects so far behind the start or beyond the end of a push, and to its sides no farther than it is long, take part.
@@ -109,7 +105,7 @@ class SlidingTable:
         self._fingers = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._gripper = (
             _fingers_shape(self._fingers, linkage.FINGER_THICKNESS_M, _REACHES_TIPS),
-            _fingers_shape(self._fingers, _CRANKS_M, _REACHES_CRANKS),
+            _fingers_shape(self._fingers, linkage.CRANKS_M[0], _REACHES_CRANKS),
         )
 
     def push(self, start: Array, theta: float, length_m: float, tip_m: float) -> dict[int, Array]:
@@ -138,7 +134,7 @@ class SlidingTable:
         for i in taking_part:
             body, shapes = self._sliders[i].body, self._sliders[i].shapes
             reaches = _REACHES_TIPS * bool(self._heights[i] > tip_m)
-            reaches |= _REACHES_CRANKS * bool(self._heights[i] > tip_m + _CRANKS_ABOVE_TIPS_M)
+            reaches |= _REACHES_CRANKS * bool(self._heights[i] > tip_m + linkage.CRANKS_ABOVE_TIPS_M)
             for shape in shapes:
                 shape.filter = pymunk.ShapeFilter(categories=_OBJECT | reaches)
             body.position, body.angle = tuple(self._centers[i].tolist()), 0.0
@@ -161,7 +157,7 @@ class SlidingTable:
         rel = self._centers - start
         ahead, aside = rel @ along, np.abs(rel @ np.array([-along[1], along[0]]))
         part = (ahead > -_BEYOND_M) & (ahead < 2 * length_m + _BEYOND_M) & (aside < length_m)
-        fingers = math.hypot(_CRANKS_M, linkage.FINGER_BREADTH_M / 2) + _OVERLAP_M
+        fingers = math.hypot(linkage.CRANKS_M[0], linkage.FINGER_BREADTH_M / 2) + _OVERLAP_M
         met = part & (aside < self._reaches + fingers) & (self._heights > tip_m)
         free_m = (ahead - self._reaches)[met].min() - fingers if met.any() else length_m
         return np.flatnonzero(part).tolist(), float(free_m)

@@ -21,7 +21,7 @@ from policy.inference import Inference
 from policy.network import PUSH
 from policy.prospects import Prospects
 from policy.push_line import free_to_descend, push_line
-from policy.selection import push_mask, pushes
+from policy.selection import possible_pushes, push_mask, pushes
 from policy.training.environment import PushGraspEnv
 from policy.weights import load_named
 from robotcell.cell import open_cell
@@ -91,8 +91,9 @@ def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict
     def promise(line, rotation):
         return prospects.after(goal, foresight.around(goal, foresight.play(line, rotation)))
 
-    def proposed(middle):
-        chosen = pushes(q, np.broadcast_to(mask, q.shape), middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
+    def proposed(middle, beside):
+        possible = possible_pushes(mask, middle, free, PUSH_M, RESOLUTION_M, beside)
+        chosen = pushes(q, possible, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
         return [promise(push.line, push.rotation) for push in chosen]
 
     cells = np.argwhere(mask)
@@ -107,10 +108,12 @@ def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict
             break
     # Where each cell is the middle that its push is for, none is beside it.
     itself = np.stack(np.indices(mask.shape), axis=-1).astype(np.float64)
+    middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), itself.shape)
     return {
         "at random": drawn[:ROTATIONS],
-        "the best Q of each rotation": proposed(itself),
-        "the same, less beside the middle": proposed(np.broadcast_to(np.argwhere(targets).mean(axis=0), itself.shape)),
+        "the best Q of each rotation": proposed(itself, 2**15),
+        "the same, less beside the middle": proposed(middle, 2**15),
+        "the same, near the middle": proposed(middle, 8),
         "many at random": drawn,
     }
 

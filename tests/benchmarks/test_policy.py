@@ -22,7 +22,7 @@ from policy.network import GRASP, PUSH
 from policy.networks import make_network
 from policy.prospects import Prospects
 from policy.push_line import free_to_descend, push_line
-from policy.selection import push_mask
+from policy.selection import possible_pushes, push_mask
 from policy.weights import load_named
 from robotcell.cell import open_cell
 from robotcell.config import load_config
@@ -77,11 +77,19 @@ def test_encode(benchmark, heightmap):
     assert benchmark(encode, close_gaps(heightmap.height_m), heightmap.color).shape == (5, 224, 224)
 
 
-@pytest.mark.parametrize("primitive", [GRASP, PUSH], ids=["grasp", "push"])
-def test_maps(benchmark, heightmap, inference, primitive):
-    planes, observation = encode(close_gaps(heightmap.height_m), heightmap.color), observe(heightmap)
-    cells = observation.goal if primitive == GRASP else push_mask(observation.goal, observation.objects)
-    assert np.isfinite(benchmark(inference.maps, planes, cells, primitive)[:, cells]).all()
+def test_grasp_maps(benchmark, heightmap, inference):
+    planes, goal = encode(heightmap.closed_m, heightmap.color), observe(heightmap).goal
+    assert np.isfinite(benchmark(inference.maps, planes, goal, GRASP)[:, goal]).all()
+
+
+def test_push_maps(benchmark, config, heightmap, inference):
+    """Near the middle of the goal, as the policy asks for them."""
+    planes, observation = encode(heightmap.closed_m, heightmap.color), observe(heightmap)
+    free = free_to_descend(heightmap.closed_m, config.workspace)
+    mask = push_mask(observation.goal, observation.objects)
+    middle = np.broadcast_to(np.argwhere(observation.goal).mean(axis=0), (*mask.shape, 2))
+    possible = possible_pushes(mask, middle, free, config.motion.push_m, config.workspace.resolution_m, beside=8)
+    assert np.isfinite(benchmark(inference.maps, planes, possible, PUSH)[possible]).all()
 
 
 def test_play(benchmark, config, heightmap, inference):

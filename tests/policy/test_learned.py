@@ -20,10 +20,10 @@ class Maps:
 
     def __init__(self):
         self.grasp = np.zeros((8, 224, 224), np.float32)
-        self.push = np.zeros((16, 224, 224), np.float32)
         # No map of a network is flat.
+        self.push = np.tile(np.linspace(0, 0.01, 224, dtype=np.float32), (16, 224, 1))
         for place in (GOAL, OTHER):
-            self.grasp[0][place][0, 0] = self.push[0][place][12, 12] = 0.01
+            self.grasp[0][place][0, 0] = 0.01
 
     def maps(self, planes, cells, primitive):
         assert planes.shape == (5, 224, 224)

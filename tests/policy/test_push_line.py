@@ -59,6 +59,15 @@ def test_the_unknown_is_no_place_to_come_down():
     assert line_through(heights, (112, 112), 8) is not None
 
 
+@pytest.mark.parametrize("height", [0.04, 0.10])
+def test_the_gripper_does_not_come_down_on_what_is_higher_than_its_fingers(height):
+    # The fingers fit between block and wall, and the cranks above them only over a low wall.
+    heights = table((BLOCK, BLOCK))
+    heights[90:135, 70:81] = height
+    found = line_through(heights, (112, 112), 0)
+    assert (found is None) == (height > 0.05)
+
+
 def test_nothing_to_meet_is_no_push():
     assert line_through(table(), (112, 112), 3) is None
 
