@@ -21,7 +21,7 @@ from robotcell.executor import Ending, Execution, Executor
 from robotcell.heightmap import Heightmap, build_heightmap
 from robotcell.journal import ActionRow, Frame, Journal, Metrics, OutcomeRow
 from robotcell.perception import Instance, Segmentation, find_goal, segment
-from robotcell.primitives import HELD_AFTER_LIFT, plan_action, plan_retreat
+from robotcell.primitives import HELD_AFTER_LIFT, plan_action, plan_retreat, push_segment
 from robotcell.safety import check_config, check_plan
 
 if TYPE_CHECKING:
@@ -40,6 +40,10 @@ MAX_PUSHES_IN_A_ROW = 5
 MAX_FAILURES_IN_A_ROW = 10
 # A cell whose height changes by more than this has changed hands; five times the depth noise of the camera.
 _CHANGED_M = 0.010
+# A push moves what is this near to its way, and what that meets.
+_STIRRED_M = 0.06
+# A goal that was seen may reach so far beyond the part of it that was.
+_UNSEEN_PART_M = 0.02
 # An object has left its place when this share of the cells that show it is lower than before.
 _GONE_SHARE = 0.6
 # A push after which less of the table than this looks different moved nothing: a third of a block's smallest face.
@@ -452,7 +456,9 @@ def _uncover(view: View, place: npt.NDArray[np.bool_], barred: tuple[Action, ...
         NoTarget: nothing is seen where the goal may be.
     """
     labels = view.segmentation.labels
-    hiding = (labels > 0) & np.isin(labels, np.unique(labels[place]))
+    # What was seen of the goal need not have been all of it.
+    size = 2 * round(_UNSEEN_PART_M / view.heightmap.workspace.resolution_m) + 1
+    hiding = (labels > 0) & (cv2.dilate(place.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
     if not hiding.any():
         raise NoTarget("the goal is not seen any more, and nothing hides the place where it was; look for it by hand")
     return Observation(view.heightmap, labels, hiding, barred, may_push=True, may_grasp=False)
@@ -466,12 +472,17 @@ def _whereabouts(
         return None
     if action.primitive is Primitive.GRASP:
         return place
-    length = round(config.motion.push_m / config.workspace.resolution_m)
+    workspace = config.workspace
+    # What is near its way may have gone along, as far as the push went.
+    (row, col), (end_row, end_col) = (workspace.cell(*at) for at in push_segment(action, config))
+    breadth = 2 * round(_STIRRED_M / workspace.resolution_m)
+    stirred = cv2.line(np.zeros(place.shape, np.uint8), (col, row), (end_col, end_row), 1, breadth)
+    length = round(config.motion.push_m / workspace.resolution_m)
     trace = np.zeros((2 * length + 1, 2 * length + 1), np.uint8)
     # Dilation reads the trace backwards.
     tip = (round(length * (1 - np.cos(action.theta))), round(length * (1 - np.sin(action.theta))))
     cv2.line(trace, (length, length), tip, 1)
-    return np.asarray(cv2.dilate(place.astype(np.uint8), trace) > 0)
+    return np.asarray(place | (cv2.dilate(((stirred > 0) & place).astype(np.uint8), trace) > 0))
 
 
 def _taken(decision: Decision, after: View) -> Instance | None:

@@ -215,18 +215,19 @@ def test_a_hidden_goal_is_searched_for_by_ten_pushes(config: CellConfig, monkeyp
     assert "10 failed attempts in a row" in report.reason
 
 
+@pytest.mark.parametrize(("x", "carried"), [(-0.55, True), (-0.65, False)], ids=["beside it", "far from it"])
 def test_a_hidden_goal_is_looked_for_where_a_push_may_have_taken_it(
-    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch, x: float, carried: bool
 ) -> None:
     hide_goal(monkeypatch, {1})
-    # 0.1 m in the direction of -y, away from both cubes: from red's place the way reaches blue.
-    policy = Scripted([push_at(-0.65, 0.06, rotation=12)])
+    # 0.1 m in the direction of -y, past both cubes: from red's place the way reaches blue.
+    policy = Scripted([push_at(x, 0.06, rotation=12)])
     run(config, policy, ("red",))
     goal = policy.seen[1].goal
     assert goal is not None
     workspace = policy.seen[1].heightmap.workspace
     assert goal[workspace.cell(*RED)]
-    assert goal[workspace.cell(*BLUE)]
+    assert goal[workspace.cell(*BLUE)] == carried
 
 
 def test_a_goal_that_was_lost_on_its_way_is_not_searched_for(
