@@ -27,11 +27,11 @@ MAX_FORCE_N = 40.0
 CLOSED_LENGTH_M = 0.213
 # The tcp: between the tips of the closed fingers, axes of the flange. The fingers close along its x axis.
 T_FLANGE_TCP = make_transform(np.eye(3), (0.0, 0.0, CLOSED_LENGTH_M))
-# Flange to palm (the pivots of the cranks are 126 mm from the flange).
-PALM_M = 0.128
+# Flange to palm, and to the pivots of the cranks.
+PALM_M, PIVOTS_M = 0.128, 0.126
 # The closed cranks, along the closing direction and across it, from the middle, and their lower ends above the tips;
 # the body of the gripper likewise (public RG2 models, rounded).
-CRANKS_M, CRANKS_ABOVE_TIPS_M = (0.022, 0.012), CLOSED_LENGTH_M - 0.126 - CRANK_LENGTH_M
+CRANKS_M, CRANKS_ABOVE_TIPS_M = (0.022, 0.012), CLOSED_LENGTH_M - PIVOTS_M - CRANK_LENGTH_M
 BODY_M, BODY_ABOVE_TIPS_M = (0.035, 0.024), CLOSED_LENGTH_M - PALM_M
 # A finger tip, across the closing direction and along it. Measured from the public RG2 models.
 FINGER_BREADTH_M = 0.022

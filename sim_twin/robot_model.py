@@ -47,7 +47,7 @@ _FINGER_MASS_KG = 0.03
 # A crank's pivot is just behind the palm, 17 mm off the middle, and its second, parallel crank further in (public RG2
 # models, rounded).
 _PIVOT_X = 0.017
-_PIVOT_Z = linkage.PALM_M - 0.002
+_PIVOT_Z = linkage.PIVOTS_M
 _SECOND_PIVOT = (-0.009, 0.014)
 _KNUCKLE_TO_TIP = linkage.CLOSED_LENGTH_M - _PIVOT_Z - linkage.CRANK_LENGTH_M * math.cos(linkage.CLOSED_ANGLE)
 # From the knuckle to the inner face of the finger: closed, the two faces meet in the middle.
