@@ -34,8 +34,8 @@ _LANE = 10
 # A grasp is worth the mean of its neighbours, cells beside its object counting nothing: a lone peak is an error of the
 # network, and at an edge the fingers slip. Standard deviation in cells.
 _SMOOTH_CELLS = 1.5
-# Maps whose values differ by less than this say nothing.
-_FLAT = 1e-6
+# Maps whose values differ by less than this say nothing; of fewer values than that, equal ones are no sign of it.
+_FLAT, _FLAT_FROM = 1e-6, 20
 
 
 def check_maps(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], name: str) -> None:
@@ -49,7 +49,7 @@ def check_maps(q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], name: st
         problem = f"are empty, of shape {q.shape} with {np.count_nonzero(mask)} cells asked for"
     elif not np.isfinite(values).all():
         problem = f"hold {np.count_nonzero(~np.isfinite(values))} values that are not finite"
-    elif np.ptp(values) < _FLAT:
+    elif values.size >= _FLAT_FROM and np.ptp(values) < _FLAT:
         problem = f"are flat, every value is {float(values.flat[0]):.4g}"
     else:
         return

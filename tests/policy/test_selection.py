@@ -18,6 +18,13 @@ def test_maps_that_say_something_pass():
     check_maps(maps, np.arange(16).reshape(4, 4) > 0, "grasp")
 
 
+def test_a_single_place_to_push_is_not_flat():
+    maps = np.full((16, 4, 4), np.nan, np.float32)
+    possible = np.zeros(maps.shape, np.bool_)
+    possible[3, 1, 2], maps[3, 1, 2] = True, 0.5
+    check_maps(maps, possible, "push")
+
+
 @pytest.mark.parametrize(
     ("maps", "problem"),
     [
