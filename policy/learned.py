@@ -45,7 +45,7 @@ _PUSH_REACHES = 3
 # [cells]: the network is shown the less for it. More and anywhere where a goal is hidden, since it need not lie in the
 # middle of what hides it.
 _LANES, _LANES_TO_SEARCH = 1, 4
-_BESIDE, _ANYWHERE = 8, 2**15
+_ASIDE = 8
 # Each grasp that failed on the scene as it stands says that the network is too sure of itself there.
 _TRUST = 0.6
 # So many of the best grasps are looked at for whether the fingers come down beside what stands around. The network
@@ -174,7 +174,7 @@ class LearnedPolicy:
             middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
         # Under one of these a hidden goal is.
         wanted = set(np.unique(observation.labels[targets]).tolist()) if observation.goal is not None else None
-        lanes, beside = (_LANES, _BESIDE) if observation.may_grasp else (_LANES_TO_SEARCH, _ANYWHERE)
+        lanes, beside = (_LANES, _ASIDE) if observation.may_grasp else (_LANES_TO_SEARCH, math.inf)
         mask = targets
         for _ in range(_PUSH_REACHES):
             mask = push_mask(mask | targets, observation.objects)

@@ -99,10 +99,10 @@ def push_line(
 ) -> PushLine | None:
     """The push of length `push_m` in direction `rotation` through a cell; None where there is none."""
     row, col = push_starts(free, np.array([cell]), rotation, push_m, resolution_m)[0]
-    return None if row < 0 else line_from(height_m, free, (int(row), int(col)), rotation, push_m, resolution_m)
+    return None if row < 0 else _line_from(height_m, free, (int(row), int(col)), rotation, push_m, resolution_m)
 
 
-def line_from(
+def _line_from(
     height_m: npt.NDArray[np.float32],
     free: npt.NDArray[np.bool_],
     start: tuple[int, int],

@@ -70,7 +70,7 @@ class Copies:
             margin: in cells.
         """
         each = np.broadcast_to(cells, (len(rotations), *cells.shape[-2:]))
-        rows, cols = np.nonzero(cells if cells.ndim == 2 else cells.any(axis=0))
+        rows, cols = np.nonzero(np.logical_or.reduce(each))
         asked = each[:, rows, cols]
         # Whole cells, here and below: so quarter turns bring cells onto cells.
         middle = (int(rows.min() + rows.max()) // 2, int(cols.min() + cols.max()) // 2)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.push_line import PushLine, line_from, normal, push_starts
+from policy.push_line import PushLine, normal, push_line, push_starts
 from robotcell.decision import ROTATIONS
 from robotcell.errors import ConfigError
 
@@ -21,11 +21,9 @@ if TYPE_CHECKING:
 
 # Paper: 15 dilations of 3x3.
 _DILATIONS = 15
-# Pushes are tried through cells so far apart [cells], so many of each rotation in the order of their value, and so many
-# at a time.
+# Pushes are tried through cells so far apart [cells], so many of each rotation in the order of their value.
 _APART = 3
 _PUSH_TRIES = 400
-_AT_A_TIME = 50
 # The Q of a push loses so much by each cell that its way passes beside the middle of what it is to free
 # (`docs/policy.md`).
 _BESIDE = 0.015
@@ -102,7 +100,7 @@ def possible_pushes(
     free: npt.NDArray[np.bool_],
     push_m: float,
     resolution_m: float,
-    beside: int,
+    beside: float,
 ) -> npt.NDArray[np.bool_]:
     """(K, H, W) cells, some apart, through which pushes can be made near the middle of what they are to free.
 
@@ -112,7 +110,7 @@ def possible_pushes(
         free: (H, W) cells where the fingers may come down.
         push_m: length of a push.
         resolution_m: size of a cell.
-        beside: no farther beside the middle than this [cells], or than the nearest that has a place to begin.
+        beside: no farther beside the middle than this [cells], or this farther than the nearest that can begin.
     """
     cells = np.argwhere(thinned(mask, _APART))
     away = cells - middle[cells[:, 0], cells[:, 1]]
@@ -123,7 +121,7 @@ def possible_pushes(
             some = cells[near]
             begins = push_starts(free, some, k, push_m, resolution_m)[:, 0] >= 0
             if begins.any():
-                begins &= aside[near] <= max(beside, aside[near][begins].min() + beside)
+                begins &= aside[near] <= aside[near][begins].min() + beside
                 possible[k, some[begins, 0], some[begins, 1]] = True
                 break
     return possible
@@ -177,32 +175,17 @@ def pushes(
         order = np.argsort(_BESIDE * np.abs(aside) - values[k], kind="stable")
         order = order[allowed[k, order]][:_PUSH_TRIES]
         taken: set[int] = set()
-        for i, start in _starting(free, cells, order, k, push_m, resolution_m):
+        for i in order.tolist():
             if (lane := round(aside[i] / _LANE)) in taken:
                 continue
-            line = line_from(height_m, free, start, k, push_m, resolution_m)
+            cell = (int(cells[i, 0]), int(cells[i, 1]))
+            line = push_line(height_m, free, cell, k, push_m, resolution_m)
             if line is None:
                 continue
-            yield Candidate(k, (int(cells[i, 0]), int(cells[i, 1])), float(values[k, i]), line)
+            yield Candidate(k, cell, float(values[k, i]), line)
             taken.add(lane)
             if len(taken) == lanes:
                 break
-
-
-def _starting(
-    free: npt.NDArray[np.bool_],
-    cells: npt.NDArray[np.intp],
-    order: npt.NDArray[np.intp],
-    rotation: int,
-    push_m: float,
-    resolution_m: float,
-) -> Iterator[tuple[int, tuple[int, int]]]:
-    """Those of the cells (N, 2), in an order, through which a push has a place to begin, and that place."""
-    for first in range(0, len(order), _AT_A_TIME):
-        some = order[first : first + _AT_A_TIME]
-        starts = push_starts(free, cells[some], rotation, push_m, resolution_m)
-        for j in np.flatnonzero(starts[:, 0] >= 0):
-            yield int(some[j]), (int(starts[j, 0]), int(starts[j, 1]))
 
 
 def surface_at(height_m: npt.NDArray[np.float32], cell: tuple[int, int]) -> float:

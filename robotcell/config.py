@@ -197,8 +197,8 @@ class CameraMount(_Table):
 class GripperUse(_Table):
     """How the gripper is used."""
 
-    # With 40 N, fingers that close on novel objects press too hard on what lies beneath in 12 of 308 grasps, and miss
-    # or lose 9; with 25 N in none of 296, and 4 (`novel` of the benchmark). 25 N carries 1 kg at a friction of 0.2.
+    # With 40 N, fingers that close on novel objects press too hard on what lies beneath more often than with 25 N
+    # (policy/data/MODEL_CARD.md); 25 N carries 1 kg at a friction of 0.2.
     force_n: Annotated[float, Field(ge=linkage.MIN_FORCE_N, le=linkage.MAX_FORCE_N)] = 25.0
     # Narrower than the stroke: wide-open fingers collide with neighbours, and their tips draw back by 40 mm.
     preshape_m: Annotated[float, Field(gt=0, le=linkage.MAX_WIDTH_M)] = 0.080

@@ -5,6 +5,7 @@ suite `challenging`. Pushes are chosen in several ways and played; prints how ma
 promises, on average.
 """
 
+import math
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
@@ -111,8 +112,8 @@ def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict
     middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), itself.shape)
     return {
         "at random": drawn[:ROTATIONS],
-        "the best Q of each rotation": proposed(itself, 2**15),
-        "the same, less beside the middle": proposed(middle, 2**15),
+        "the best Q of each rotation": proposed(itself, math.inf),
+        "the same, less beside the middle": proposed(middle, math.inf),
         "the same, near the middle": proposed(middle, 8),
         "many at random": drawn,
     }
