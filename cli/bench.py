@@ -16,7 +16,7 @@ from policy.evaluation.benchmark import Settings, by_suite, finished, load, plan
 from policy.evaluation.page import write_page
 from policy.evaluation.report import results_table
 from policy.evaluation.suites import SUITES, describe_suite
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 from robotcell.errors import CellError, ConfigError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def run_bench(
         given: the options that say what to run and were given: suite, policy, trials, seed, scenes, meshes, cell.
         resume: folder of a benchmark to continue, which says what to run.
         json_file: where all metrics and trials go.
-        workers: see `policy.parallel.run_tasks`.
+        workers: see `policy.rollouts.run_tasks`.
         ray_address: likewise.
     """
     try:

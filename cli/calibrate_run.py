@@ -10,34 +10,34 @@ import typer
 from pydantic import ValidationError
 from rich.text import Text
 
-from calibration.collection import RunningEstimate, collect, collect_by_hand, open_session
-from calibration.planning import HeldBoard
-from calibration.readers import read_file
-from calibration.report import write_report
-from calibration.session import read_session
-from calibration.solution import save_if_better
-from calibration.solve import solve
-from calibration.target import DEFAULT_BOARD, bolted_to_flange, held_by_gripper, save_page
+from calibration.collect.collection import RunningEstimate, collect, collect_by_hand, open_session
+from calibration.collect.planning import HeldBoard
+from calibration.collect.session import read_session
+from calibration.report.page import write_report
+from calibration.solve.readers.records import read_file
+from calibration.solve.solution import save_if_better
+from calibration.solve.solver import solve
+from calibration.target.board import DEFAULT_BOARD, bolted_to_flange, held_by_gripper, save_page
 from cli.calibrate_solve import print_solution
 from cli.console import progress, report_error, results
-from robotcell.album import save_picture
-from robotcell.camera_calibration import CharucoBoard, FixedTag
 from robotcell.cell import Cell, open_cell
-from robotcell.config import CellConfig, load_config
-from robotcell.drift import check_tags, find_tags
+from robotcell.config.calibration_file import CharucoBoard, FixedTag
+from robotcell.config.schema import CellConfig, load_config
 from robotcell.errors import CalibrationError, CellError, ConfigError
-from robotcell.executor import Executor
-from robotcell.linkage import MIN_WIDTH_M
-from robotcell.primitives import Grip, MotionPlan
-from robotcell.safety import check_config, check_plan
+from robotcell.geometry.rg2 import MIN_WIDTH_M
+from robotcell.jobs.pictures import save_picture
+from robotcell.motion.executor import Executor
+from robotcell.motion.path_check import check_config, check_plan
+from robotcell.motion.plan import Grip, MotionPlan
+from robotcell.perception.tags import check_tags, find_tags
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
 
-    from calibration.shot import Shot
-    from calibration.solution import Solution
+    from calibration.collect.capture import Shot
+    from calibration.solve.solution import Solution
 
 # Squares along x and y, their side and that of the markers [mm], dictionary.
 BoardOptions: TypeAlias = tuple[int, int, float, float | None, str]

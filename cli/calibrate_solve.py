@@ -10,22 +10,22 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from calibration.readers import read_file
-from calibration.series import read_series
-from calibration.session import read_session
-from calibration.solution import save_if_better
-from calibration.solve import solve, solve_series
+from calibration.collect.session import read_session
+from calibration.solve.readers.records import read_file
+from calibration.solve.series import read_series
+from calibration.solve.solution import save_if_better
+from calibration.solve.solver import solve, solve_series
 from cli.console import progress, report_error, results
 from robotcell.errors import CalibrationError, CellError, ConfigError
-from robotcell.geometry import matrix_to_rotvec
+from robotcell.geometry.transforms import matrix_to_rotvec
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rich.console import Console
 
-    from calibration.solution import Solution
-    from robotcell.camera_calibration import Mount
+    from calibration.solve.solution import Solution
+    from robotcell.config.calibration_file import Mount
 
 _REFUSED = 1
 

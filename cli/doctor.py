@@ -12,8 +12,8 @@ from rich.text import Text
 
 from cli.console import progress, report_error, results
 from robotcell.cell import open_cell
-from robotcell.config import load_config
-from robotcell.doctor import Finding, Grade, examine
+from robotcell.config.schema import load_config
+from robotcell.drivers.doctor.examine import Finding, Grade, examine
 from robotcell.errors import CellError
 
 if TYPE_CHECKING:

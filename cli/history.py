@@ -10,9 +10,9 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import report_error, results
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 from robotcell.errors import CellError
-from robotcell.journal import Job, Journal, Metrics
+from robotcell.jobs.journal import Job, Journal, Metrics
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,14 +13,14 @@ from rich.text import Text
 
 from cli.console import progress, report_error, results
 from policy import make_policy
-from robotcell.album import Album, describe, draw_decision, save_picture
 from robotcell.cell import open_cell
-from robotcell.config import CellConfig, load_config
+from robotcell.config.schema import CellConfig, load_config
 from robotcell.errors import CellError, ConfigError, NoTarget
-from robotcell.jobs import Decision, Outcome, Report, View, make_run_dir, preview, run_job
-from robotcell.journal import Journal
-from robotcell.perception import check_goal_word
-from robotcell.safety import check_config
+from robotcell.jobs.job import Decision, Outcome, Report, View, make_run_dir, preview, run_job
+from robotcell.jobs.journal import Journal
+from robotcell.jobs.pictures import Album, describe, draw_decision, save_picture
+from robotcell.motion.path_check import check_config
+from robotcell.perception.segmentation import check_goal_word
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import progress, report_error, results
-from robotcell.config import CellConfig, load_config
+from robotcell.config.schema import CellConfig, load_config
 from robotcell.errors import CellError, ConfigError, ConnectionLost
-from sim_twin.wire.serve import ServedCell, is_loopback
+from sim_twin.wire.cell import ServedCell, is_loopback
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

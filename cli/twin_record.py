@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from cli.console import progress, report_error, results
 from cli.twin import as_twin
 from robotcell.errors import CellError
-from sim_twin.renderer import FRAMES_PER_S
-from sim_twin.wire.recorder import record
+from sim_twin.d415.renderer import FRAMES_PER_S
+from sim_twin.wire.d415.recorder import record
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

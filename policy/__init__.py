@@ -9,8 +9,8 @@ from robotcell.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from robotcell.config import CellConfig
-    from robotcell.decision import Policy
+    from robotcell.config.schema import CellConfig
+    from robotcell.jobs.policy_api import Policy
 
 
 def make_policy(name: str, config: CellConfig) -> Policy:
@@ -25,7 +25,7 @@ def make_policy(name: str, config: CellConfig) -> Policy:
 
 
 def _heuristic(config: CellConfig) -> Policy:
-    from policy.heuristic import HeuristicPolicy
+    from policy.heuristic.policy import HeuristicPolicy
 
     return HeuristicPolicy(config)
 
@@ -50,9 +50,9 @@ def _single_stage(config: CellConfig) -> Policy:
 
 def _of_weights(name: str, weights: str, config: CellConfig, *, may_push: bool = True) -> Policy:
     """A policy of weights that come with the package."""
-    from policy.inference import Inference
-    from policy.learned import LearnedPolicy
-    from policy.weights import load_named
+    from policy.learned.policy import LearnedPolicy
+    from policy.network.inference import Inference
+    from policy.network.weights import load_named
 
     return LearnedPolicy(config, Inference(load_named(weights)[0]), name, may_push=may_push)
 

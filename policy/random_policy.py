@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.grasping import DIRECTIONS
-from policy.repeats import repeats
-from policy.surface import cell_centers, estimate_surface
-from robotcell.decision import ROTATIONS, Action, Primitive
+from policy.barred import repeats
+from policy.grasp_room import DIRECTIONS
+from policy.shadows import cell_centers, estimate_surface
 from robotcell.errors import NoTarget
+from robotcell.jobs.policy_api import ROTATIONS, Action, Primitive
 
 if TYPE_CHECKING:
-    from robotcell.config import CellConfig
-    from robotcell.decision import Observation
+    from robotcell.config.schema import CellConfig
+    from robotcell.jobs.policy_api import Observation
 
 # A push starts this near to its target (paper: its mask for pushes is dilated by 15 cells of 2 mm).
 _BESIDE_M = 0.030

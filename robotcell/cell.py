@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from robotcell.config import CellConfig, find_backend
+from robotcell.config.schema import CellConfig, find_backend
 from robotcell.errors import ConnectionLost, DeviceFault, GuardTripped
 
 if TYPE_CHECKING:

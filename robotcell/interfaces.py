@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from typing_extensions import Self
 
-    from robotcell.geometry import Array
+    from robotcell.geometry.transforms import Array
 
 
 class ArmMode(enum.Enum):

@@ -23,11 +23,11 @@ from policy import make_policy
 from policy.evaluation.metrics import Metrics, measure
 from policy.evaluation.suites import find_suite
 from policy.evaluation.trials import Failure, Trial, TrialResult, run_trial
-from policy.parallel import run_tasks
-from robotcell.config import CellConfig
+from policy.rollouts import run_tasks
+from robotcell.config.schema import CellConfig
 from robotcell.errors import ConfigError
-from robotcell.jobs import make_run_dir
-from robotcell.safety import check_config
+from robotcell.jobs.job import make_run_dir
+from robotcell.motion.path_check import check_config
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from robotcell.errors import ConfigError
-from robotcell.palette import PALETTE
-from sim_twin.scene_files import FRAMES_FILE, read_scene
-from sim_twin.scenes import GOAL, scene_names
+from robotcell.perception.colors import PALETTE
+from sim_twin.scenes.catalog import GOAL, scene_names
+from sim_twin.scenes.files import FRAMES_FILE, read_scene
 
 if TYPE_CHECKING:
     from pathlib import Path

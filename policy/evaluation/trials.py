@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import cv2
 
 from policy import make_policy
-from robotcell.album import describe, draw_decision, draw_view
-from robotcell.config import BackendChoice, JournalPlace
+from robotcell.config.schema import BackendChoice, JournalPlace
 from robotcell.errors import CellError
-from robotcell.jobs import Decision, Outcome, Result, View, run_job
-from robotcell.journal import Journal
-from robotcell.palette import PALETTE
-from sim_twin.backend import open_twin
+from robotcell.jobs.job import Decision, Outcome, Result, View, run_job
+from robotcell.jobs.journal import Journal
+from robotcell.jobs.pictures import describe, draw_decision, draw_view
+from robotcell.perception.colors import PALETTE
+from sim_twin.devices.backend import open_twin
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
     from policy.evaluation.suites import Case
     from robotcell.cell import Cell
-    from robotcell.config import CellConfig
-    from robotcell.decision import Action, Observation, Policy
-    from sim_twin.world import World
+    from robotcell.config.schema import CellConfig
+    from robotcell.jobs.policy_api import Action, Observation, Policy
+    from sim_twin.world.world import World
 
 # Apart by more than any benchmark has trials, so that a redrawn scene is no other trial's.
 _REDRAW_STRIDE = 1_000_000
@@ -74,7 +74,7 @@ class Failure:
 
     Attributes:
         action: what was tried, in words.
-        result: a `robotcell.jobs.Result`, or "not complete" of a trial that ended without a failed action.
+        result: a `robotcell.jobs.job.Result`, or "not complete" of a trial that ended without a failed action.
         detail: why.
         picture: name of the picture's file.
     """
@@ -98,7 +98,7 @@ class TrialResult:
         completed: what the job says.
         true_completed: what the simulator says: an object of the goal's colour, or every object, lies in the bin.
         reason: why the job ended where it is not complete.
-        actions, pushes, grasp_attempts, grasp_successes: as in `robotcell.journal.Metrics`.
+        actions, pushes, grasp_attempts, grasp_successes: as in `robotcell.jobs.journal.Metrics`.
         failures: how often each result that is no success occurred.
         shown: failures with pictures: the first two and the last.
         simulated_s: on the cell's clock.

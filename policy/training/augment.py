@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.encoding import encode
-from policy.network import GRASP
-from policy.rotation import turn_matrix
+from policy.network.encoding import encode
+from policy.network.q_network import GRASP
+from policy.network.rotation import turn_matrix
 from policy.training.shard import unpack_height
-from robotcell.decision import ROTATIONS
+from robotcell.jobs.policy_api import ROTATIONS
 
 if TYPE_CHECKING:
     from policy.training.replay import View

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from robotcell.errors import ConfigError
-from robotcell.whole_file import replaced
+from robotcell.io.atomic_file import replaced
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from policy.encoding import encode
-from policy.grasping import Jaw, find_grasps, lay_table
-from policy.push_line import push_line
-from policy.selection import best_cells, faded, push_mask
-from policy.surface import estimate_surface
+from policy.grasp_room import Jaw, find_grasps, lay_table
+from policy.learned.selection import best_cells, faded, push_mask
+from policy.network.encoding import encode
+from policy.push.line import push_line
+from policy.shadows import estimate_surface
 from policy.training.environment import GRASP, PUSH, Outcome, PushGraspEnv, State, Trial
 from policy.training.shard import Shard, pack_height
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from policy.inference import Inference
+    from policy.network.inference import Inference
     from policy.training.config import CollectSettings
-    from robotcell.config import CellConfig
+    from robotcell.config.schema import CellConfig
 
 # Of the attempts that exploit, a share takes the best action; the others one of so many of the best.
 _GREEDY_SHARE = 0.4
@@ -140,7 +140,7 @@ def collect(collection: Collection) -> Shard:
     config = load_config(None, {})
     network = None
     if collection.weights is not None:
-        from policy.inference import Inference
+        from policy.network.inference import Inference
 
         network = Inference.load(collection.weights)
     book = _Book()

@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from robotcell.whole_file import replaced
+from robotcell.io.atomic_file import replaced
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """The task as a Gymnasium environment over the twin: heightmaps in, grasps and pushes out, the paper's rewards.
 
-The machine is the gripper on slides (`sim_twin.rig`), so an attempt costs a tenth of what the arm needs. What is
-random of the cell (camera, colours, friction, masses, sizes) is drawn anew for each scene from its seed.
+The machine is the gripper on slides (`sim_twin.world.sliding_gripper`), so an attempt costs a tenth of what the arm
+needs. What is random of the cell (camera, colours, friction, masses, sizes) is drawn anew for each scene from its seed.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from policy.border import border_occupancy
-from policy.encoding import CHANNELS, encode
-from policy.network import GRASP, PUSH
-from policy.push_line import PushLine, free_to_descend, push_line
-from policy.selection import surface_at
+from policy.learned.selection import surface_at
+from policy.network.encoding import CHANNELS, encode
+from policy.network.q_network import GRASP, PUSH
+from policy.push.border import border_occupancy
+from policy.push.line import PushLine, free_to_descend, push_line
 from policy.training.scenes import training_scene
-from robotcell.config import CameraMount, CellConfig
-from robotcell.decision import ROTATIONS
+from robotcell.config.schema import CameraMount, CellConfig
 from robotcell.errors import ConfigError
-from robotcell.geometry import look_at, make_transform
-from robotcell.heightmap import Heightmap, build_heightmap
-from robotcell.perception import MIN_OBJECT_M
-from robotcell.primitives import grasp_height, near_height, push_height
-from sim_twin.backend import TwinOptions
-from sim_twin.camera import TwinCamera
-from sim_twin.noise import NoiseOptions
-from sim_twin.rig import Ending, RigWorld
-from sim_twin.world import Friction
+from robotcell.geometry.transforms import look_at, make_transform
+from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.plan import grasp_height, near_height, push_height
+from robotcell.perception.heightmap import Heightmap, build_heightmap
+from robotcell.perception.segmentation import MIN_OBJECT_M
+from sim_twin.d415.noise import NoiseOptions
+from sim_twin.devices.backend import TwinOptions
+from sim_twin.devices.camera import TwinCamera
+from sim_twin.world.sliding_gripper import Ending, RigWorld
+from sim_twin.world.world import Friction
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from robotcell.geometry import Array
+    from robotcell.geometry.transforms import Array
 
 # Paper, stage II: a push that gains more than tau of the border earns the reward.
 GAIN_TAU = 0.1
@@ -117,8 +117,8 @@ class Trial:
 class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]):
     """Push and grasp until the table is clear (stage I) or the goal is picked (stage II).
 
-    Observations are encoded heightmaps (`policy.encoding`), actions (primitive, rotation, row, col); a grasp has eight
-    rotations, so `rotation` counts modulo 8. `info` holds the labels and the goal's. `attempt` and
+    Observations are encoded heightmaps (`policy.network.encoding`), actions (primitive, rotation, row, col); a grasp
+    has eight rotations, so `rotation` counts modulo 8. `info` holds the labels and the goal's. `attempt` and
     `aside` give what a learner may ask of a simulator beyond that: other actions in the same state.
 
     Args:

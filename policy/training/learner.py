@@ -13,11 +13,11 @@ import torch
 from scipy.stats import rankdata
 from torch.nn import functional
 
-from policy.encoding import encode
-from policy.network import GRASP, GRASP_ROTATIONS, PUSH
-from policy.precision import autocast
-from policy.rotation import MARGIN, Copies
-from policy.selection import best_cells, faded
+from policy.learned.selection import best_cells, faded
+from policy.network.encoding import encode
+from policy.network.precision import autocast
+from policy.network.q_network import GRASP, GRASP_ROTATIONS, PUSH
+from policy.network.rotation import MARGIN, Copies
 from policy.training.augment import crop
 from policy.training.shard import unpack_height
 

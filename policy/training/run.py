@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from policy.network import GRASP, PUSH
-from policy.networks import make_network
-from policy.parallel import run_tasks
+from policy.network.q_network import GRASP, PUSH
+from policy.network.registry import make_network
+from policy.network.weights import save_weights
+from policy.rollouts import run_tasks
 from policy.training import collect as playing
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
 from policy.training.config import load_train_config, save_train_config, single_stage, with_rounds
@@ -32,9 +33,8 @@ from policy.training.curves import draw_curves
 from policy.training.learner import Learner
 from policy.training.replay import Replay
 from policy.training.shard import Shard
-from policy.weights import save_weights
 from robotcell.errors import ConfigError
-from robotcell.whole_file import replaced, write_whole
+from robotcell.io.atomic_file import replaced, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -67,7 +67,7 @@ def train(
         config: of the run, as `prepare` returned it.
         stage: 1 or 2.
         run: folder of the run.
-        workers: that play scenes; see `policy.parallel.run_tasks`.
+        workers: that play scenes; see `policy.rollouts.run_tasks`.
         ray_address: of a Ray cluster that sees the folder of the run under the same path.
         collect: plays the scenes of a task.
         on_progress: told while a round collects, looks ahead and learns.

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robotcell.geometry import make_transform
-from robotcell.palette import PALETTE
-from sim_twin.meshes import Mesh, hull
-from sim_twin.novel import resting_poses
-from sim_twin.scene import Scene, SceneObject, place
-from sim_twin.scenes import DROP_HALF_WIDTH_M, drop_scene
-from sim_twin.shapes import BLOCK_NAMES, Shape, block, shape_of
+from robotcell.geometry.transforms import make_transform
+from robotcell.perception.colors import PALETTE
+from sim_twin.scenes.catalog import DROP_HALF_WIDTH_M, drop_scene
+from sim_twin.scenes.meshes import Mesh, hull
+from sim_twin.scenes.novel import resting_poses
+from sim_twin.scenes.scene import Scene, SceneObject, place
+from sim_twin.scenes.shapes import BLOCK_NAMES, Shape, block, shape_of
 
 if TYPE_CHECKING:
-    from robotcell.config import CellConfig
-    from robotcell.geometry import Array
+    from robotcell.config.schema import CellConfig
+    from robotcell.geometry.transforms import Array
 
 # Shares of objects: a block as it is, a block scaled along each axis, and another solid.
 _PLAIN, _SCALED = 0.5, 0.2

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from robotcell import linkage
 from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.geometry import rg2
 from robotcell.interfaces import Gripper, GripperState
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class RG2(Gripper):
         # Whether anything came back since the last request.
         self._heard = False
         # Between the tips [m]; the tips shift the range of the bare fingers.
-        self._range_m = (linkage.MIN_WIDTH_M, linkage.MAX_WIDTH_M)
+        self._range_m = (rg2.MIN_WIDTH_M, rg2.MAX_WIDTH_M)
         # The last command (width [m], force [N]) and when it was given; None after a stop.
         self._command: tuple[float, float] | None = None
         self._commanded_at = -math.inf
@@ -132,9 +132,9 @@ class RG2(Gripper):
             registers = self._registers()
             self._check_free(registers)
             shift = registers.tip_width - registers.bare_width
-            low, high = round(linkage.MIN_WIDTH_M * _PER_M) + shift, round(linkage.MAX_WIDTH_M * _PER_M) + shift
+            low, high = round(rg2.MIN_WIDTH_M * _PER_M) + shift, round(rg2.MAX_WIDTH_M * _PER_M) + shift
             # The register of the width takes no more with tips that reach outwards.
-            self._range_m = max(0, low) / _PER_M, min(high / _PER_M, linkage.MAX_WIDTH_M)
+            self._range_m = max(0, low) / _PER_M, min(high / _PER_M, rg2.MAX_WIDTH_M)
             self._command = None
         except BaseException:
             self.close()
@@ -186,7 +186,7 @@ class RG2(Gripper):
         """
         self._need_link()
         _check_range("width", 1000 * width_m, 1000 * self._range_m[0], 1000 * self._range_m[1], "mm")
-        _check_range("force", force_n, linkage.MIN_FORCE_N, linkage.MAX_FORCE_N, "N")
+        _check_range("force", force_n, rg2.MIN_FORCE_N, rg2.MAX_FORCE_N, "N")
         registers = self._registers()
         self._check_free(registers)
         if registers.status & _BUSY:

@@ -14,7 +14,7 @@ from robotcell.errors import CellError, ConfigError
 from sim_twin.wire.faults import Fault
 
 if TYPE_CHECKING:
-    from sim_twin.wire.serve import ServedCell
+    from sim_twin.wire.cell import ServedCell
 
 REQUESTS = (
     '{"inject": {"device", "channel", "kind", "what", "value"}}, {"clear": true}, {"list": true}, {"state": true}'

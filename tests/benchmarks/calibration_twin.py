@@ -25,15 +25,15 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.collection import collect, open_session
-from calibration.planning import HeldBoard
-from calibration.rigid import change, difference
-from calibration.session import read_session
-from calibration.solve import solve
-from calibration.target import DEFAULT_BOARD, held_by_gripper
-from robotcell.config import load_config
+from calibration.collect.collection import collect, open_session
+from calibration.collect.planning import HeldBoard
+from calibration.collect.session import read_session
+from calibration.solve.rigid import change, difference
+from calibration.solve.solver import solve
+from calibration.target.board import DEFAULT_BOARD, held_by_gripper
+from robotcell.config.schema import load_config
 from robotcell.errors import CellError
-from sim_twin.backend import TwinOptions, open_twin
+from sim_twin.devices.backend import TwinOptions, open_twin
 
 LIMIT_MM, LIMIT_DEG = 0.7, 0.05
 # How far the camera stands from where the configuration has it, along and about each axis.

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from policy.parallel import run_tasks
+from policy.rollouts import run_tasks
 from policy.training import collect as collecting
 from policy.training.collect import Collection, collect
 from policy.training.config import CollectSettings

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-import policy.inference
-from policy.encoding import encode
-from policy.inference import Inference
-from policy.network import GRASP, PUSH
+import policy.network.inference
+from policy.network.encoding import encode
+from policy.network.inference import Inference
+from policy.network.q_network import GRASP, PUSH
+from policy.network.weights import load_named
 from policy.training.learner import auc
 from policy.training.shard import Shard, unpack_height
-from policy.weights import load_named
 
 MARGINS = (24, 32, 40, 56)
 SHARDS = 16
@@ -44,7 +44,7 @@ def main() -> None:
                 planes = encode(unpack_height(shard.height[state]), shard.color[state])
                 rewarded.append(bool(shard.reward[i, 1] > SUCCESS))
                 for margin, found in values.items():
-                    policy.inference.MARGIN = margin
+                    policy.network.inference.MARGIN = margin
                     found.append(float(network.maps(planes, target, primitive)[shard.rotation[i], row, col]))
         areas = ", ".join(
             f"{margin} cells {auc(np.array(found), np.array(rewarded)):.3f}" for margin, found in values.items()

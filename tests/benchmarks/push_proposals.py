@@ -15,23 +15,23 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import track
 
-from policy.encoding import encode
-from policy.foresight import Foresight
-from policy.grasping import Jaw
-from policy.inference import Inference
-from policy.network import PUSH
-from policy.prospects import Prospects
-from policy.push_line import free_to_descend, push_line
-from policy.selection import possible_pushes, push_mask, pushes
+from policy.grasp_room import Jaw
+from policy.learned.selection import possible_pushes, push_mask, pushes
+from policy.network.encoding import encode
+from policy.network.inference import Inference
+from policy.network.q_network import PUSH
+from policy.network.weights import load_named
+from policy.push.line import free_to_descend, push_line
+from policy.push.outcome import Foresight
+from policy.push.value import Prospects
 from policy.training.environment import PushGraspEnv
-from policy.weights import load_named
 from robotcell.cell import open_cell
-from robotcell.config import load_config
-from robotcell.decision import ROTATIONS
-from robotcell.heightmap import Heightmap
-from robotcell.jobs import look
-from robotcell.perception import find_goal, segment
-from sim_twin.scenes import scene_names
+from robotcell.config.schema import load_config
+from robotcell.jobs.job import look
+from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.perception.heightmap import Heightmap
+from robotcell.perception.segmentation import find_goal, segment
+from sim_twin.scenes.catalog import scene_names
 
 KINDS = ("enclosed", "packed")
 SCENES = 60

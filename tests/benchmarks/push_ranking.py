@@ -13,21 +13,21 @@ from collections import defaultdict
 import numpy as np
 from rich.progress import track
 
-from policy.encoding import encode
-from policy.foresight import Foresight
-from policy.grasping import Jaw
-from policy.inference import Inference
-from policy.learned import LearnedPolicy
-from policy.network import GRASP, PUSH
-from policy.prospects import Prospects
-from policy.push_line import push_line
-from policy.selection import push_mask
+from policy.grasp_room import Jaw
+from policy.learned.policy import LearnedPolicy
+from policy.learned.selection import push_mask
+from policy.network.encoding import encode
+from policy.network.inference import Inference
+from policy.network.q_network import GRASP, PUSH
+from policy.network.weights import load_named
+from policy.push.line import push_line
+from policy.push.outcome import Foresight
+from policy.push.value import Prospects
 from policy.training.environment import Outcome, PushGraspEnv
 from policy.training.learner import auc
-from policy.weights import load_named
-from robotcell.config import load_config
-from robotcell.decision import ROTATIONS, Observation
+from robotcell.config.schema import load_config
 from robotcell.errors import NoTarget
+from robotcell.jobs.policy_api import ROTATIONS, Observation
 
 KINDS = ("enclosed", "packed")
 SCENES = 30

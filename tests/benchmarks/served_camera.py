@@ -10,14 +10,14 @@ import time
 
 import numpy as np
 
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 from robotcell.drivers.clock import WallClock
-from robotcell.drivers.d415 import D415, D415Options
-from sim_twin.backend import TwinOptions
-from sim_twin.renderer import MODES, Renderer
-from sim_twin.wire.frames import Frame, Image, encode
-from sim_twin.world import World
-from tests.sim_twin.wire.served_camera import RawClient, ServedCamera
+from robotcell.drivers.d415.camera import D415, D415Options
+from sim_twin.d415.renderer import MODES, Renderer
+from sim_twin.devices.backend import TwinOptions
+from sim_twin.wire.d415.stream import Frame, Image, encode
+from sim_twin.world.world import World
+from tests.sim_twin.wire.d415.served_camera import RawClient, ServedCamera
 
 SECONDS = 5.0
 ROUNDS = 15

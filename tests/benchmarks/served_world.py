@@ -12,12 +12,12 @@ import time
 import numpy as np
 import psutil
 
-from robotcell import kinematics, linkage
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
-from robotcell.geometry import invert_transform, make_transform
-from sim_twin.wire.serve import ServedCell
+from robotcell.geometry import rg2, ur5e
+from robotcell.geometry.transforms import invert_transform, make_transform
+from sim_twin.wire.cell import ServedCell
 
 HOST = "127.0.0.21"
 SETTLE_S = 3.0
@@ -32,7 +32,7 @@ def plough(address: str) -> None:
     corners = []
     for x, y in [(x, side * 0.15) for x in (-0.58, -0.54, -0.5, -0.46, -0.42) for side in (-1, 1)]:
         tool_down = make_transform(np.diag([1.0, -1.0, -1.0]), (x, y, 0.03))
-        near = kinematics.inverse(tool_down @ invert_transform(linkage.T_FLANGE_TCP), q)
+        near = ur5e.inverse(tool_down @ invert_transform(rg2.T_FLANGE_TCP), q)
         assert near is not None
         q = near
         corners.append(q)

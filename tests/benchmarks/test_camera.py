@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
-from robotcell.config import CameraMount
-from sim_twin.camera import TwinCamera
-from sim_twin.noise import NoiseOptions, degrade_color, degrade_depth
-from sim_twin.raycast import RayCaster
-from sim_twin.renderer import MODES
+from robotcell.config.schema import CameraMount
+from sim_twin.d415.noise import NoiseOptions, degrade_color, degrade_depth
+from sim_twin.d415.rays import RayCaster
+from sim_twin.d415.renderer import MODES
+from sim_twin.devices.camera import TwinCamera
 from tests.sim_twin.boxes import table_with_blocks
 
 RESOLUTIONS = pytest.mark.parametrize("resolution", sorted(MODES, reverse=True))

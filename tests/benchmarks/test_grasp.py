@@ -9,19 +9,19 @@ import pytest
 
 from policy import make_policy
 from robotcell.cell import Cell, open_cell
-from robotcell.config import load_config
-from robotcell.decision import Action, Observation, Primitive
-from robotcell.executor import Executor
-from robotcell.jobs import View, look
-from robotcell.primitives import plan_action
-from robotcell.safety import CheckedPlan, check_plan
+from robotcell.config.schema import load_config
+from robotcell.jobs.job import View, look
+from robotcell.jobs.policy_api import Action, Observation, Primitive
+from robotcell.motion.executor import Executor
+from robotcell.motion.path_check import CheckedPlan, check_plan
+from robotcell.motion.plan import plan_action
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from pytest_benchmark.fixture import BenchmarkFixture
 
-    from robotcell.decision import Policy
+    from robotcell.jobs.policy_api import Policy
 
 ROUNDS = 7
 

@@ -14,22 +14,22 @@ import pytest
 import torch
 
 from policy import make_policy
-from policy.encoding import encode
-from policy.foresight import Foresight
-from policy.grasping import Jaw
-from policy.inference import Inference
-from policy.network import GRASP, PUSH
-from policy.networks import make_network
-from policy.prospects import Prospects
-from policy.push_line import free_to_descend, push_line
-from policy.selection import possible_pushes, push_mask
-from policy.weights import load_named
+from policy.grasp_room import Jaw
+from policy.learned.selection import possible_pushes, push_mask
+from policy.network.encoding import encode
+from policy.network.inference import Inference
+from policy.network.q_network import GRASP, PUSH
+from policy.network.registry import make_network
+from policy.network.weights import load_named
+from policy.push.line import free_to_descend, push_line
+from policy.push.outcome import Foresight
+from policy.push.value import Prospects
 from robotcell.cell import open_cell
-from robotcell.config import load_config
-from robotcell.decision import Observation, Primitive
+from robotcell.config.schema import load_config
 from robotcell.errors import NoTarget
-from robotcell.heightmap import build_heightmap, close_gaps
-from robotcell.perception import find_goal, segment
+from robotcell.jobs.policy_api import Observation, Primitive
+from robotcell.perception.heightmap import build_heightmap, close_gaps
+from robotcell.perception.segmentation import find_goal, segment
 
 OBJECTS = 30
 ROUNDS = 20

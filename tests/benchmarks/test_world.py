@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from robotcell.config import load_config
-from sim_twin.backend import open_twin
+from robotcell.config.schema import load_config
+from sim_twin.devices.backend import open_twin
 
 COUNTS = pytest.mark.parametrize("count", [10, 30])
 STEPS = 120

@@ -17,10 +17,10 @@ import time
 import numpy as np
 import psutil
 
-from sim_twin.wire.ur_variables import OUTPUTS
-from tests.sim_twin.wire.control_script import CONTROL_SCRIPT
-from tests.sim_twin.wire.plant import START_Q, ServedController
-from tests.sim_twin.wire.rtde_client import RtdeClient, reading
+from sim_twin.wire.ur.variables import OUTPUTS
+from tests.sim_twin.wire.ur.control_script import CONTROL_SCRIPT
+from tests.sim_twin.wire.ur.rtde_client import RtdeClient, reading
+from tests.sim_twin.wire.ur.stub_world import START_Q, ServedController
 
 _HOST = "127.0.0.18"
 _NAMES = [name for name in OUTPUTS if "register" not in name]

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calibration.projection import intrinsics_vector, project
-from calibration.rigid import change, exp, invert
-from calibration.views import Corners, Views
-from robotcell.camera_calibration import CameraModel, CharucoBoard, Mount
-from robotcell.geometry import look_at, make_transform
+from calibration.solve.projection import intrinsics_vector, project
+from calibration.solve.rigid import change, exp, invert
+from calibration.solve.views import Corners, Views
+from robotcell.config.calibration_file import CameraModel, CharucoBoard, Mount
+from robotcell.geometry.transforms import look_at, make_transform
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from robotcell.geometry import Array
+    from robotcell.geometry.transforms import Array
 
 DATE = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
 CAMERA = CameraModel(serial="018322070101", width=1280, height=720, fx=926.0, fy=926.0, cx=640.0, cy=360.0)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from calibration.rigid import difference
+from calibration.solve.rigid import difference
 from cli.main import app
-from robotcell.camera_calibration import load_calibration
+from robotcell.config.calibration_file import load_calibration
+from tests.calibration.solve.readers.test_records import corners_file, write
+from tests.calibration.solve.test_series import recording
+from tests.calibration.solve.test_series import write as write_series
 from tests.calibration.synthetic import as_poses, make_views, to_json
-from tests.calibration.test_readers import corners_file, write
-from tests.calibration.test_series import recording
-from tests.calibration.test_series import write as write_series
 
 MOVEIT = Path(__file__).parents[1] / "calibration" / "data" / "moveit_pose_samples.json"
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from robotcell.config import load_config
-from sim_twin.wire.serve import ServedCell
+from robotcell.config.schema import load_config
+from sim_twin.wire.cell import ServedCell
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from robotcell.cell import open_cell
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from robotcell.cell import Cell
-    from robotcell.config import CellConfig
+    from robotcell.config.schema import CellConfig
 
 TWIN = {"backend.name": "twin", "backend.options.objects": 1}
 HOST, MODBUS_PORT, CAMERA_PORT = "127.0.0.42", 15042, 30442
@@ -42,7 +42,7 @@ def config(request: pytest.FixtureRequest) -> Iterator[CellConfig]:
     """A cell file of each backend, and what it needs around it."""
     with ExitStack() as stack:
         if request.param == "hardware":
-            from sim_twin.wire.serve import ServedCell
+            from sim_twin.wire.cell import ServedCell
 
             stack.enter_context(ServedCell(load_config(None, TWIN), HOST, MODBUS_PORT, CAMERA_PORT))
         yield load_config(None, BACKENDS[request.param])

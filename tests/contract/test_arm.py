@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from robotcell import kinematics, linkage
 from robotcell.errors import ConnectionLost, UnsafeMotion
-from robotcell.geometry import make_transform, rotation_angle, rotation_z
+from robotcell.geometry import rg2, ur5e
+from robotcell.geometry.transforms import make_transform, rotation_angle, rotation_z
 from robotcell.interfaces import ArmMode
 
 if TYPE_CHECKING:
     from robotcell.cell import Cell
-    from robotcell.geometry import Array
+    from robotcell.geometry.transforms import Array
 
 PERIOD_S = 0.008
 
@@ -52,9 +52,9 @@ def test_state_is_one_consistent_measurement(cell: Cell) -> None:
     assert state.q.shape == state.qd.shape == state.wrench.shape == (6,)
     assert np.isfinite(state.wrench).all()
     assert state.t <= cell.clock.now()
-    tip = make_transform(np.eye(3), (0, 0, linkage.CLOSED_LENGTH_M))
+    tip = make_transform(np.eye(3), (0, 0, rg2.CLOSED_LENGTH_M))
     # A real arm's own calibration differs from the nominal one by some millimetres.
-    assert np.abs(state.T_base_tcp - kinematics.forward(state.q) @ tip).max() < 0.01
+    assert np.abs(state.T_base_tcp - ur5e.forward(state.q) @ tip).max() < 0.01
     np.testing.assert_allclose(state.q, cell.config.motion.home_q, atol=0.01)
 
 

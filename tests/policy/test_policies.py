@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from policy import make_policy
-from robotcell.config import load_config
-from robotcell.decision import Observation, Primitive
+from robotcell.config.schema import load_config
 from robotcell.errors import ConfigError
+from robotcell.jobs.policy_api import Observation, Primitive
 from tests.robotcell.maps import heightmap
 
 CONFIG = load_config()

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.config import Workspace
-from robotcell.decision import ROTATIONS, Action, Primitive
-from robotcell.heightmap import Heightmap, TablePlane
+from robotcell.config.schema import Workspace
+from robotcell.jobs.policy_api import ROTATIONS, Action, Primitive
+from robotcell.perception.heightmap import Heightmap, TablePlane
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -6,17 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell import kinematics, linkage
-from robotcell.config import load_config
-from robotcell.geometry import Array, make_transform
-from sim_twin import backend, scenes
-from sim_twin.shapes import block
+from robotcell.config.schema import load_config
+from robotcell.geometry import rg2, ur5e
+from robotcell.geometry.transforms import Array, make_transform
+from sim_twin.devices import backend
+from sim_twin.scenes import catalog as scenes
+from sim_twin.scenes.shapes import block
 
 if TYPE_CHECKING:
     import pytest
 
     from robotcell.cell import Cell
-    from sim_twin.world import World
+    from sim_twin.world.world import World
 
 PERIOD_S = 0.008
 # Near the middle of the workspace, elbow up.
@@ -49,7 +50,7 @@ def tool_down(x: float, y: float, z: float, yaw: float = 0.0) -> Array:
 
 def joints_at(T_base_tcp: Array) -> Array:
     """Joint angles, elbow up, that put the tcp there."""
-    q = kinematics.inverse(T_base_tcp @ np.linalg.inv(linkage.T_FLANGE_TCP), _Q_NEAR)
+    q = ur5e.inverse(T_base_tcp @ np.linalg.inv(rg2.T_FLANGE_TCP), _Q_NEAR)
     assert q is not None
     return q
 

@@ -12,12 +12,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from robotcell.cell import open_cell
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from sim_twin.world import World
+    from sim_twin.world.world import World
 
 
 def draw(

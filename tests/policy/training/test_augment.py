@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.encoding import encode
-from policy.network import GRASP, PUSH
-from policy.rotation import Copies
+from policy.network.encoding import encode
+from policy.network.q_network import GRASP, PUSH
+from policy.network.rotation import Copies
 from policy.training.augment import CROP_CELLS, crop
 from policy.training.replay import View
 from policy.training.shard import unpack_height

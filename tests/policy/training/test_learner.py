@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from policy.network import GRASP, PUSH, QNetwork
+from policy.network.q_network import GRASP, PUSH, QNetwork
 from policy.training import augment
 from policy.training.collect import Collection
 from policy.training.config import CollectSettings, LearningSettings

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from policy.network.weights import load_weights
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
 from policy.training.config import LearningSettings, StageSettings, TrainConfig
 from policy.training.run import prepare, read_metrics, train
 from policy.training.shard import Shard
-from policy.weights import load_weights
 from robotcell.errors import ConfigError
 from tests.policy.training import toy
 

@@ -11,12 +11,12 @@ import pytest
 from pydantic import ValidationError
 from pymodbus.client import ModbusTcpClient
 
-from robotcell.config import load_config
+from robotcell.config.schema import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
+from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.faults import Fault, Kind
-from sim_twin.wire.serve import ServedCell
 from tests.sim_twin.cells import joints_at, tool_down
 
 HOST = "127.0.0.26"

@@ -1,0 +1,1 @@
+"""From views to a camera pose with its uncertainty and a verdict."""

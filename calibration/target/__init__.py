@@ -1,0 +1,1 @@
+"""The calibration board: its layout, how it is held, and how it is seen."""

@@ -1,0 +1,378 @@
+"""`cell.toml`: one file that describes a cell, checked as a whole.
+
+With no file the twin with its defaults. Lengths in metres, angles in radians, base frame.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+
+from robotcell.config.calibration_file import CameraCalibration, load_calibration
+from robotcell.errors import ConfigError
+from robotcell.geometry import rg2
+from robotcell.geometry.transforms import Array, check_transform, look_at
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from robotcell.cell import Cell
+
+
+def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
+    if not interval[0] < interval[1]:
+        raise ValueError("the first number must be below the second")
+    return interval
+
+
+Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Positive = Annotated[float, Field(gt=0)]
+Vector3 = tuple[float, float, float]
+
+_DOCS = "docs/configuration.md"
+
+
+class _Table(BaseModel):
+    """A table of cell.toml: unknown keys are refused, numbers are finite, nothing changes after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Workspace(_Table):
+    """The rectangle of the table that the heightmap covers.
+
+    Rows run along base y, columns along base x; the centre of cell (row, col) is at
+    x = x_min + (col + 0.5) resolution, y = y_min + (row + 0.5) resolution.
+    """
+
+    x: Interval = (-0.724, -0.276)
+    y: Interval = (-0.224, 0.224)
+    resolution_m: Annotated[float, Field(ge=0.0005, le=0.01)] = 0.002
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns) of the heightmap."""
+        rows, cols = ((b - a) / self.resolution_m for a, b in (self.y, self.x))
+        return max(1, round(rows)), max(1, round(cols))
+
+    def position(self, row: float, col: float) -> tuple[float, float]:
+        """(x, y) [m] of the centre of a cell."""
+        return self.x[0] + (col + 0.5) * self.resolution_m, self.y[0] + (row + 0.5) * self.resolution_m
+
+    def cell(self, x: float, y: float) -> tuple[int, int]:
+        """(row, col) of the cell that contains a point [m]; outside the heightmap if the point is."""
+        return (
+            int(np.floor((y - self.y[0]) / self.resolution_m)),
+            int(np.floor((x - self.x[0]) / self.resolution_m)),
+        )
+
+
+class Table(_Table):
+    """The table top: the plane z = height_m."""
+
+    height_m: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+
+
+class Bin(_Table):
+    """The box that picked objects are dropped into."""
+
+    center: tuple[float, float] = (-0.30, 0.45)
+    size: tuple[Positive, Positive] = (0.36, 0.30)
+    wall_height_m: Annotated[float, Field(gt=0, le=0.5)] = 0.12
+
+
+class KeepOut(_Table):
+    """A box that no part of arm, gripper or load may enter."""
+
+    name: str
+    x: Interval
+    y: Interval
+    z: Interval
+
+
+class Motion(_Table):
+    """How the arm moves. Speeds are those of the leading joint and of the tcp."""
+
+    # Tool upright beside the workspace, next to the bin: arm and gripper are 0.1 m out of the view of the workspace.
+    home_q: tuple[float, float, float, float, float, float] = (-0.8370, -1.4768, 1.2793, -1.3733, -1.5708, 0.7338)
+    joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 1.5
+    # Universal Robots' default for movej.
+    joint_acceleration_rad_s2: Annotated[float, Field(gt=0, le=40)] = 1.4
+    linear_speed_m_s: Annotated[float, Field(gt=0, le=1)] = 0.4
+    # Universal Robots' default for movel.
+    linear_acceleration_m_s2: Annotated[float, Field(gt=0, le=10)] = 1.2
+    # A finger that lands on a block is stopped at 30 to 85 N (measured in the twin; 90 N at 0.10, 75 N at 0.06).
+    guarded_speed_m_s: Annotated[float, Field(gt=0, le=0.25)] = 0.08
+    approach_m: Annotated[float, Field(ge=0.02, le=0.4)] = 0.15
+    push_m: Annotated[float, Field(ge=0.01, le=0.3)] = 0.10
+    # A guarded descent that meets this force has met an object: it ends, and the grasp is given up.
+    contact_force_n: Annotated[float, Field(gt=0, le=100)] = 30.0
+    # Finger tips sweep down by up to 15 mm as they close. Where that presses harder than this on what lies beneath,
+    # they open again, and the grasp is given up. Grasps that held pressed with 3 to 45 N, one of 26 with 65 N and one
+    # with 81 N (measured in the twin).
+    closing_force_n: Annotated[float, Field(gt=0, le=250)] = 70.0
+
+
+class Limits(_Table):
+    """What the safety layer allows. It adds to the controller's own safety settings and never replaces them."""
+
+    # The tcp stays inside this box (the workspace, the bin and the way between them); z is above the table.
+    x: Interval = (-0.80, 0.20)
+    y: Interval = (-0.45, 0.65)
+    z: Interval = (0.0, 0.70)
+    joint_margin_rad: Annotated[float, Field(ge=0, le=1)] = 0.05
+    joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 2.0
+    tool_speed_m_s: Annotated[float, Field(gt=0, le=3)] = 1.5
+    # Below the 150 N at which a UR5e's factory safety preset stops the arm.
+    force_n: Annotated[float, Field(gt=0, le=250)] = 100.0
+    # Smallest singular value of the Jacobian.
+    singularity: Annotated[float, Field(ge=0, le=0.2)] = 0.02
+    # Distance that arm and gripper keep from keep-outs and from themselves.
+    clearance_m: Annotated[float, Field(ge=0, le=0.1)] = 0.005
+    state_age_s: Annotated[float, Field(gt=0, le=1)] = 0.1
+    frame_age_s: Annotated[float, Field(gt=0, le=5)] = 1.0
+    min_coverage: Annotated[float, Field(ge=0, le=1)] = 0.6
+    max_tilt_rad: Annotated[float, Field(gt=0, le=0.2)] = 0.02
+    max_table_offset_m: Annotated[float, Field(gt=0, le=0.05)] = 0.006
+
+
+class CameraMount(_Table):
+    """The fixed camera: its mode, and where it stands, by a calibration, by a transform or by two points."""
+
+    resolution: Annotated[str, Field(pattern="^(640x480|1280x720)$")] = "640x480"
+    # 20 degrees off the vertical: the taller block of two hides little of the lower one, and the post stands clear.
+    position: Vector3 = (-0.80, 0.0, 0.80)
+    look_at: Vector3 = (-0.5, 0.0, 0.0)
+    # T_base_camera, rows of a 4x4 matrix; stands above the two points when given.
+    T_base_camera: tuple[tuple[float, ...], ...] | None = None
+    # A file that robotcell calibrate wrote; stands above the two points when given. A twin's camera really stands where
+    # the two points have it, and this file is what the program believes.
+    calibration: Path | None = None
+
+    _measured: CameraCalibration | None = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _is_a_pose(self) -> CameraMount:
+        if self.calibration is not None:
+            if self.T_base_camera is not None:
+                raise ValueError("calibration and T_base_camera both say where the camera stands; keep one")
+            self._measured = load_calibration(self.calibration)
+            if self._measured.mount != "fixed":
+                raise ValueError(f"{self.calibration} is of a camera on the flange; the cell's camera is fixed")
+        self.pose()
+        return self
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the image [px]."""
+        width, height = self.resolution.split("x")
+        return int(width), int(height)
+
+    @property
+    def measured(self) -> CameraCalibration | None:
+        """What the calibration file holds; None without one. Whether it fits the camera, its `check` says."""
+        return self._measured
+
+    def pose(self) -> Array:
+        """T_base_camera (4, 4)."""
+        return self.nominal() if self._measured is None else self._measured.pose()
+
+    def nominal(self) -> Array:
+        """T_base_camera (4, 4) without the calibration file: by the transform, or by the two points."""
+        if self.T_base_camera is not None:
+            return check_transform(self.T_base_camera, "T_base_camera")
+        return look_at(self.position, self.look_at)
+
+
+class GripperUse(_Table):
+    """How the gripper is used."""
+
+    # With 40 N, fingers that close on novel objects press too hard on what lies beneath more often than with 25 N
+    # (policy/data/MODEL_CARD.md); 25 N carries 1 kg at a friction of 0.2.
+    force_n: Annotated[float, Field(ge=rg2.MIN_FORCE_N, le=rg2.MAX_FORCE_N)] = 25.0
+    # Narrower than the stroke: wide-open fingers collide with neighbours, and their tips draw back by 40 mm.
+    preshape_m: Annotated[float, Field(gt=0, le=rg2.MAX_WIDTH_M)] = 0.080
+    # Fingers closer than this hold nothing.
+    empty_width_m: Annotated[float, Field(gt=0, le=0.05)] = 0.005
+    # The finger tips stay this far above the table.
+    tip_clearance_m: Annotated[float, Field(ge=0.001, le=0.05)] = 0.003
+
+
+class PolicyChoice(_Table):
+    """Which policy decides."""
+
+    name: str = "learned"
+
+
+class JournalPlace(_Table):
+    """Where jobs are recorded."""
+
+    # Any SQLAlchemy URL; by default a SQLite file in the folder of the runs.
+    url: str | None = None
+    runs: Path = Path("runs")
+
+    @property
+    def default_file(self) -> Path:
+        """The SQLite file that is the journal when no URL is given."""
+        return self.runs / "journal.db"
+
+    def database_url(self) -> str:
+        """The SQLAlchemy URL of the journal."""
+        return self.url or f"sqlite:///{self.default_file}"
+
+
+class BackendChoice(_Table):
+    """Which devices stand behind the interfaces; the backend itself checks its options."""
+
+    name: str = "twin"
+    options: dict[str, Any] = {}
+
+
+class CellConfig(_Table):
+    """A whole cell."""
+
+    workspace: Workspace = Workspace()
+    table: Table = Table()
+    bin: Bin = Bin()
+    keep_out: tuple[KeepOut, ...] = ()
+    motion: Motion = Motion()
+    limits: Limits = Limits()
+    camera: CameraMount = CameraMount()
+    gripper: GripperUse = GripperUse()
+    policy: PolicyChoice = PolicyChoice()
+    journal: JournalPlace = JournalPlace()
+    backend: BackendChoice = BackendChoice()
+
+
+class Backend(Protocol):
+    """An entry point of the group `robotcell.backends`: a class with these two members."""
+
+    Options: type[BaseModel]
+
+    @staticmethod
+    def open(config: CellConfig) -> Cell:
+        """The cell's devices, not yet connected; `config.backend.options` fits `Options`."""
+        ...
+
+
+def find_backend(name: str) -> Backend:
+    """The backend of that name.
+
+    Raises:
+        ConfigError: there is none, or it cannot be imported; the message lists those that are installed.
+    """
+    installed = {entry.name: entry for entry in entry_points(group="robotcell.backends")}
+    if name not in installed:
+        raise ConfigError(f"no backend is called {name!r}; installed: {', '.join(sorted(installed)) or 'none'}")
+    try:
+        backend: Backend = installed[name].load()
+    except ImportError as error:
+        raise ConfigError(
+            f"backend {name!r} cannot be imported ({error}); install its extra, for the twin: "
+            "pip install 'robotcell[twin]'"
+        ) from error
+    return backend
+
+
+def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> CellConfig:
+    """Read and check a cell file.
+
+    Args:
+        path: a TOML file; None for the twin with its defaults.
+        overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
+
+    Raises:
+        ConfigError: naming every bad key at once, each with its value and what is allowed.
+    """
+    values = read_toml(path, "examples/cell.toml") if path else {}
+    if path:
+        _beside(values, path)
+    for key, value in (overrides or {}).items():
+        _set(values, key, value)
+    problems: list[str] = []
+    config = None
+    try:
+        config = CellConfig.model_validate(values)
+    except ValidationError as error:
+        problems += wrong_values(error, _DOCS)
+    backend_table = values.get("backend", {})
+    if isinstance(backend_table, dict):
+        try:
+            backend = find_backend(str(backend_table.get("name", BackendChoice().name)))
+            backend.Options.model_validate(backend_table.get("options", {}))
+        except ConfigError as error:
+            problems.append(f"backend.name: {error}")
+        except ValidationError as error:
+            problems += wrong_values(error, _DOCS, ("backend", "options"))
+    if config is None or problems:
+        place = str(path) if path else "the cell's settings"
+        raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
+    return config
+
+
+def read_toml(path: Path, example: str) -> dict[str, Any]:
+    """The values of a TOML file.
+
+    Args:
+        path: of the file.
+        example: a file to start from, named where there is none.
+
+    Raises:
+        ConfigError: it cannot be read, or is no TOML.
+    """
+    try:
+        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        return values
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from {example}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+
+
+def wrong_values(error: ValidationError, docs: str, prefix: tuple[str, ...] = ()) -> list[str]:
+    """A line for each wrong key of a file: the key, its value and what is wrong with it.
+
+    Args:
+        error: of its validation.
+        docs: the page that lists the keys.
+        prefix: of the keys, where a part of the file was validated.
+    """
+    lines = []
+    for detail in error.errors():
+        key = ".".join(str(part) for part in (*prefix, *detail["loc"]))
+        if detail["type"] == "missing":
+            lines.append(f"{key}: missing")
+        elif detail["type"] == "extra_forbidden":
+            lines.append(f"{key} = {detail['input']!r}: unknown key; see {docs} for those that exist")
+        else:
+            lines.append(f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}")
+    return lines
+
+
+def _beside(values: dict[str, Any], path: Path) -> None:
+    """A relative path of the calibration file starts at the folder of the cell's file."""
+    camera = values.get("camera")
+    if isinstance(camera, dict) and isinstance(camera.get("calibration"), str):
+        camera["calibration"] = str(path.parent / camera["calibration"])
+
+
+def _set(values: dict[str, Any], dotted_key: str, value: object) -> None:
+    *tables, key = dotted_key.split(".")
+    for table in tables:
+        inner = values.setdefault(table, {})
+        if not isinstance(inner, dict):
+            return  # the file holds something else there, which the validation reports
+        values = inner
+    values[key] = value

@@ -1,0 +1,45 @@
+"""The entry point `hardware` of the group `robotcell.backends`. Each device imports its library when it connects."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import BaseModel, ConfigDict
+
+from robotcell.cell import Cell
+from robotcell.drivers.clock import WallClock
+from robotcell.drivers.d415.camera import D415, D415Options
+from robotcell.drivers.rg2 import RG2, RG2Options
+from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
+
+if TYPE_CHECKING:
+    from robotcell.config.schema import CellConfig
+
+
+class HardwareOptions(BaseModel):
+    """`backend.options` of a cell with real devices, or with devices that a twin serves."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    arm: UR5eOptions
+    gripper: RG2Options
+    camera: D415Options = D415Options()
+
+
+class HardwareBackend:
+    """A cell of a UR5e, an RG2 behind a Compute Box and a D415."""
+
+    Options: type[BaseModel] = HardwareOptions
+
+    @staticmethod
+    def open(config: CellConfig) -> Cell:
+        """The cell of a configuration, not yet connected."""
+        options = HardwareOptions.model_validate(config.backend.options)
+        clock = WallClock()
+        return Cell(
+            config,
+            UR5e(options.arm, clock),
+            RG2(options.gripper, clock),
+            D415(options.camera, config.camera, clock),
+            clock,
+        )

@@ -1,0 +1,1 @@
+"""The Intel RealSense D415 over librealsense."""

@@ -1,0 +1,1 @@
+"""Looks at every device of a hardware cell and says what is wrong."""

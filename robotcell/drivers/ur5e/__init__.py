@@ -1,0 +1,1 @@
+"""The UR5e over RTDE and its dashboard."""

@@ -1,0 +1,169 @@
+"""A model of arm, gripper and obstacles that is coarse, conservative and fast: spheres against boxes.
+
+Each link is a chain of spheres along its axis, in the frames of `ur5e.link_frames`. Radii cover the housings of
+the UR5e (joint housings 120 to 150 mm, upper arm 110 mm, forearm 90 mm and wrists 90 mm across) and of the RG2's body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from robotcell.config.schema import CellConfig, KeepOut
+from robotcell.geometry import rg2, ur5e
+
+if TYPE_CHECKING:
+    from robotcell.geometry.transforms import Array
+
+# Distance of the upper arm's tube from the plane of the base, along the shoulder axis (UR5e drawing: 0.138 m).
+_UPPER_ARM_OFFSET_M = 0.138
+_SPACING_M = 0.03
+FINGER_SPACING_M = 0.014
+# The camera's housing and its post stand behind its optical centre.
+_CAMERA_M = 0.12
+_POST_M = 0.06
+# A camera that looks straighter down than this hangs from above: a post would stand in its view.
+_HANGING_SLOPE = 0.1
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """Spheres fixed to links.
+
+    Attributes:
+        link: (N,) index of the frame that carries each sphere, 0 base .. 6 flange.
+        center: (N, 3) in that frame [m].
+        radius: (N,) [m].
+        group: (N,) index of the body that it belongs to, in order from the base.
+    """
+
+    link: npt.NDArray[np.int64]
+    center: Array
+    radius: Array
+    group: npt.NDArray[np.int64]
+
+
+# (frame, start, end, radius) of each body in order from the base.
+_BODIES = (
+    (0, (0.0, 0.0, 0.03), (0.0, 0.0, 0.1625), 0.075),
+    (1, (0.0, 0.0, 0.0), (0.0, 0.0, _UPPER_ARM_OFFSET_M), 0.070),
+    (2, (0.425, 0.0, _UPPER_ARM_OFFSET_M), (0.0, 0.0, _UPPER_ARM_OFFSET_M), 0.060),
+    (2, (0.0, 0.0, _UPPER_ARM_OFFSET_M), (0.0, 0.0, 0.0), 0.060),
+    (3, (0.3922, 0.0, 0.015), (0.0, 0.0, 0.015), 0.055),
+    (4, (0.0, -0.1333, 0.0), (0.0, 0.0, 0.0), 0.050),
+    (5, (0.0, 0.0997, 0.0), (0.0, 0.0, 0.0), 0.048),
+    (6, (0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 0.045),
+    (6, (0.0, 0.0, 0.05), (0.0, 0.0, rg2.PALM_M), 0.055),
+)
+# Bodies this many places apart in the chain share a joint housing or a neighbour's, and cannot touch.
+_NEIGHBOURS = 2
+
+
+def robot_spheres() -> Spheres:
+    """The spheres of arm and gripper body, without the fingers (their tips are checked as the tcp)."""
+    link, center, radius, group = [], [], [], []
+    for index, (frame, start, end, r) in enumerate(_BODIES):
+        length = float(np.linalg.norm(np.subtract(end, start)))
+        for s in np.linspace(0.0, 1.0, max(2, int(np.ceil(length / _SPACING_M)) + 1)):
+            link.append(frame)
+            center.append((1 - s) * np.array(start) + s * np.array(end))
+            radius.append(r)
+            group.append(index)
+    return Spheres(np.array(link), np.array(center), np.array(radius), np.array(group))
+
+
+SPHERES = robot_spheres()
+
+
+def sphere_centers(q: npt.ArrayLike) -> Array:
+    """Centres (..., N, 3) of `SPHERES` in the base frame [m] at joint angles (..., 6)."""
+    frames = ur5e.link_frames(q)[..., SPHERES.link, :, :]
+    return np.asarray(np.einsum("...nij,nj->...ni", frames[..., :3, :3], SPHERES.center) + frames[..., :3, 3])
+
+
+def obstacles(config: CellConfig) -> tuple[KeepOut, ...]:
+    """Everything that arm and gripper must not enter: the keep-outs of the file, the bin, the camera and its post."""
+    table = config.table.height_m
+    (bx, by), (sx, sy) = config.bin.center, config.bin.size
+    bin_box = _box("bin", (bx, by, table + config.bin.wall_height_m / 2), (sx, sy, config.bin.wall_height_m))
+    x, y, z = config.camera.pose()[:3, 3]
+    camera = _box("camera", (x, y, z), (_CAMERA_M, _CAMERA_M, _CAMERA_M))
+    post = camera_post(config)
+    return (*config.keep_out, bin_box, camera, *((post,) if post else ()))
+
+
+def camera_post(config: CellConfig) -> KeepOut | None:
+    """The post that carries the camera, on the side that it does not look at; None for one that hangs from above."""
+    T = config.camera.pose()
+    x, y, z = T[:3, 3]
+    slope = float(np.linalg.norm(T[:2, 2]))
+    if slope < _HANGING_SLOPE:
+        return None
+    px, py = np.array([x, y]) - (_CAMERA_M + _POST_M) / 2 * T[:2, 2] / slope
+    low, high = config.table.height_m, z + _CAMERA_M / 2
+    return _box("camera post", (px, py, (low + high) / 2), (_POST_M, _POST_M, max(high - low, _POST_M)))
+
+
+def _box(name: str, center: tuple[float, float, float], size: tuple[float, float, float]) -> KeepOut:
+    x, y, z = ((c - s / 2, c + s / 2) for c, s in zip(center, size, strict=True))
+    return KeepOut(name=name, x=x, y=y, z=z)
+
+
+def box_distance(box: KeepOut, points: Array) -> npt.NDArray[np.float64]:
+    """Distance [m] of points (..., 3) from a box; 0 inside."""
+    low, high = np.array([box.x, box.y, box.z]).T
+    return np.asarray(np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=-1))
+
+
+def self_distance(centers: Array) -> npt.NDArray[np.float64]:
+    """Smallest gap (...,) [m] between bodies that are not neighbours, of sphere centres (..., N, 3)."""
+    return np.asarray(
+        (
+            np.linalg.norm(centers[..., _PAIRS[0], :] - centers[..., _PAIRS[1], :], axis=-1)
+            - (SPHERES.radius[_PAIRS[0]] + SPHERES.radius[_PAIRS[1]])
+        ).min(axis=-1)
+    )
+
+
+def finger_points(T_base_tcp: Array, load_m: float) -> Array:
+    """Points (..., K, 3) [m] that stand for the fingers and for a load that reaches `load_m` below the tcp.
+
+    They fill the block that the fingers can be in, from palm to tip and opened any way, at most
+    `FINGER_SPACING_M` apart.
+    """
+    half = rg2.MAX_WIDTH_M / 2 + rg2.FINGER_THICKNESS_M
+    x = np.linspace(-half, half, int(2 * half / FINGER_SPACING_M) + 2)
+    y = np.array([-0.5, 0.0, 0.5]) * rg2.FINGER_BREADTH_M
+    reach = rg2.CLOSED_LENGTH_M - rg2.PALM_M + load_m
+    z = load_m - np.linspace(0.0, reach, int(reach / FINGER_SPACING_M) + 2)
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], grid) + T_base_tcp[..., None, :3, 3])
+
+
+def blocks_view(q: npt.ArrayLike, config: CellConfig) -> bool:
+    """Whether arm or gripper at joint angles q (6,) stand between the camera and the workspace."""
+    eye = config.camera.pose()[:3, 3]
+    T_tcp = ur5e.forward(q) @ rg2.T_FLANGE_TCP
+    fingers = finger_points(T_tcp, 0.0)
+    centers = np.concatenate([sphere_centers(q), fingers])
+    radii = np.concatenate([SPHERES.radius, np.full(len(fingers), FINGER_SPACING_M)])
+    below = centers[:, 2] < eye[2] - radii
+    away = centers[below] - eye
+    # Their shadows on the table, as if the camera were a lamp.
+    stretch = (eye[2] - config.table.height_m) / -away[:, 2]
+    x, y = (eye[:2] + stretch[:, None] * away[:, :2]).T
+    size = radii[below] * stretch * np.linalg.norm(away, axis=1) / -away[:, 2]
+    (x0, x1), (y0, y1) = config.workspace.x, config.workspace.y
+    return bool(((x > x0 - size) & (x < x1 + size) & (y > y0 - size) & (y < y1 + size)).any())
+
+
+def _sphere_pairs() -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    i, j = np.triu_indices(len(SPHERES.group), k=1)
+    apart = SPHERES.group[j] - SPHERES.group[i] > _NEIGHBOURS
+    return i[apart], j[apart]
+
+
+_PAIRS = _sphere_pairs()

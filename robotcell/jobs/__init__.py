@@ -1,0 +1,1 @@
+"""Pick-goal and pick-all: the loop, its verdicts, its journal and its pictures."""

@@ -1,0 +1,220 @@
+"""Pictures of a job: one per action (camera view, heightmap with the action drawn in, heights) and an animation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from robotcell.errors import CellError
+from robotcell.geometry import rg2
+from robotcell.geometry.transforms import invert_transform, transform_points
+from robotcell.jobs.policy_api import Action, Primitive
+from robotcell.motion.plan import push_segment
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from robotcell.config.schema import CellConfig
+    from robotcell.jobs.job import Decision, Outcome, View
+    from robotcell.perception.heightmap import Heightmap
+
+_Picture = npt.NDArray[np.uint8]
+_ToPixel = Callable[[float, float], tuple[int, int]]
+
+_PANEL_PX = 480
+_CAPTION_PX = 34
+_WHITE, _BLACK = (255, 255, 255), (0, 0, 0)
+_ACTION, _GOAL = (255, 0, 200), (255, 255, 255)
+_GOOD, _BAD, _NEUTRAL = (30, 120, 50), (150, 40, 30), (40, 40, 40)
+# Cells that were never seen.
+_UNSEEN = (60, 20, 70)
+# Heights from the table to this one span the colour scale.
+_SCALE_M = 0.12
+_ANIMATION_WIDTH_PX = 800
+_ANIMATION_STEP_MS = 900
+_ANIMATION_END_MS = 2500
+
+
+class Album:
+    """An observer of a job that leaves `step-NNN.png` and `summary.gif` in the folder of the run."""
+
+    def __init__(self, config: CellConfig) -> None:
+        self._config = config
+        self._folder: Path | None = None
+        self._view: View | None = None
+        self._pages: list[Image.Image] = []
+
+    def started(self, job_id: int, run_dir: Path) -> None:
+        """Take the folder of the run."""
+        self._folder = run_dir
+
+    def looked(self, view: View) -> None:
+        """Keep the newest view for the last page."""
+        self._view = view
+
+    def decided(self, decision: Decision) -> None:
+        """The page is drawn when the outcome is known."""
+
+    def ended(self, decision: Decision, outcome: Outcome) -> None:
+        """Draw the page of an action."""
+        color = _GOOD if outcome.success else _BAD
+        caption = f"{describe(decision)}: {outcome.result.value} ({outcome.detail})"
+        page = draw_decision(decision, self._config, caption, color)
+        if self._folder:
+            save_picture(page, self._folder / f"step-{decision.index:03d}.png")
+        self._pages.append(_small(page))
+
+    def finish(self, caption: str) -> None:
+        """Add a page of the table as it is now, and write the animation."""
+        if not self._folder or not self._view:
+            return
+        page = draw_view(self._view, None, None, self._config, caption, _NEUTRAL)
+        save_picture(page, self._folder / "end.png")
+        pages = [*self._pages, _small(page)]
+        durations = [_ANIMATION_STEP_MS] * (len(pages) - 1) + [_ANIMATION_END_MS]
+        path = self._folder / "summary.gif"
+        try:
+            pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
+        except OSError as error:
+            raise _not_written(path) from error
+
+
+def describe(decision: Decision) -> str:
+    """One line on a decision: its number, what it does and how sure the policy is."""
+    action = decision.action
+    goal = f" for {decision.goal}" if decision.goal else ""
+    angle = f"{np.degrees(action.theta):.1f} deg"
+    return f"{decision.index}. {action.primitive.value}{goal} at {angle}, q {action.q_value:.2f}"
+
+
+def draw_decision(
+    decision: Decision, config: CellConfig, caption: str, color: tuple[int, int, int] = _NEUTRAL
+) -> _Picture:
+    """A page (H, W, 3) uint8 RGB of a decision: camera view, heightmap with the action, heights."""
+    labels = decision.view.segmentation.labels
+    goal = None
+    if decision.goal is not None:
+        chosen = [i.label for i in decision.view.segmentation.instances if i.color_name == decision.goal]
+        goal = np.isin(labels, chosen)
+    return draw_view(decision.view, decision.action, goal, config, caption, color)
+
+
+def draw_view(
+    view: View,
+    action: Action | None,
+    goal: npt.NDArray[np.bool_] | None,
+    config: CellConfig,
+    caption: str,
+    color: tuple[int, int, int],
+) -> _Picture:
+    """A page (H, W, 3) uint8 RGB of a view, with an action and the outline of a goal where given.
+
+    The heightmaps are turned so that base x points up and base y to the left, as the camera sees the table.
+    """
+    camera = _camera_panel(view, action, config)
+    panels = [camera, _map_panel(view.heightmap, action, goal, config), _height_panel(view.heightmap)]
+    body = np.hstack(panels)
+    strip = np.full((_CAPTION_PX, body.shape[1], 3), color, np.uint8)
+    cv2.putText(strip, caption, (10, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _WHITE, 1, cv2.LINE_AA)
+    return np.vstack([strip, body])
+
+
+def save_picture(picture: _Picture, path: Path) -> None:
+    """Write an RGB picture as PNG.
+
+    Raises:
+        CellError: it cannot be written.
+    """
+    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise _not_written(path)
+
+
+def _not_written(path: Path) -> CellError:
+    return CellError(f"{path} cannot be written: check that its folder exists and the disk has room")
+
+
+def _small(page: _Picture) -> Image.Image:
+    height = round(page.shape[0] * _ANIMATION_WIDTH_PX / page.shape[1])
+    resized = cv2.resize(page, (_ANIMATION_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    return Image.fromarray(resized).quantize(128)
+
+
+def _camera_panel(view: View, action: Action | None, config: CellConfig) -> _Picture:
+    frame = view.frame
+    panel = frame.color.copy()
+    if action is not None:
+        point = transform_points(invert_transform(config.camera.pose()), np.array(action.xyz))
+        if point[2] > 0:
+            u = round(frame.intrinsics.fx * point[0] / point[2] + frame.intrinsics.cx)
+            v = round(frame.intrinsics.fy * point[1] / point[2] + frame.intrinsics.cy)
+            size = frame.intrinsics.width // 40
+            cv2.drawMarker(panel, (u, v), _BLACK, cv2.MARKER_CROSS, size, 5)
+            cv2.drawMarker(panel, (u, v), _ACTION, cv2.MARKER_CROSS, size, 2)
+    width = round(panel.shape[1] * _PANEL_PX / panel.shape[0])
+    return np.asarray(cv2.resize(panel, (width, _PANEL_PX), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _map_panel(
+    heightmap: Heightmap, action: Action | None, goal: npt.NDArray[np.bool_] | None, config: CellConfig
+) -> _Picture:
+    image = heightmap.color.copy()
+    image[np.isnan(heightmap.height_m)] = _UNSEEN
+    panel = _turn(image)
+    scale = panel.shape[0] / heightmap.workspace.shape[1]
+    if goal is not None:
+        outline = _turn(goal.astype(np.uint8)[..., None].repeat(3, axis=2))[..., 0].copy()
+        contours, _ = cv2.findContours(outline, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        cv2.drawContours(panel, contours, -1, _GOAL, 2)
+
+    def pixel(x: float, y: float) -> tuple[int, int]:
+        workspace = heightmap.workspace
+        rows, cols = workspace.shape
+        row, col = (
+            (y - workspace.y[0]) / workspace.resolution_m,
+            (x - workspace.x[0]) / workspace.resolution_m,
+        )
+        return round((rows - row) * scale), round((cols - col) * scale)
+
+    if action is not None and action.primitive is Primitive.GRASP:
+        _draw_fingers(panel, action, config, pixel)
+    elif action is not None:
+        start, end = push_segment(action, config)
+        for color, thickness in ((_BLACK, 6), (_ACTION, 3)):
+            cv2.arrowedLine(panel, pixel(*start), pixel(*end), color, thickness, cv2.LINE_AA, tipLength=0.2)
+    return panel
+
+
+def _draw_fingers(panel: _Picture, action: Action, config: CellConfig, pixel: _ToPixel) -> None:
+    """The two finger tips at the pre-shape, and the line on which they close."""
+    x, y, _ = action.xyz
+    along = np.array([np.cos(action.theta), np.sin(action.theta)])
+    across = np.array([-along[1], along[0]]) * rg2.FINGER_BREADTH_M / 2
+    inner = config.gripper.preshape_m / 2
+    for side in (-1, 1):
+        near = np.array([x, y]) + side * inner * along
+        far = near + side * rg2.FINGER_THICKNESS_M * along
+        corners = [pixel(*p) for p in (near - across, near + across, far + across, far - across)]
+        cv2.fillPoly(panel, [np.array(corners)], _ACTION, cv2.LINE_AA)
+        cv2.line(panel, pixel(x, y), pixel(*near), _ACTION, 2, cv2.LINE_AA)
+
+
+def _height_panel(heightmap: Heightmap) -> _Picture:
+    scaled = np.nan_to_num(np.clip(heightmap.height_m / _SCALE_M, 0.0, 1.0), nan=0.0)
+    image = cv2.cvtColor(cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    image[np.isnan(heightmap.height_m)] = _UNSEEN
+    panel = _turn(np.asarray(image, np.uint8))
+    text = f"0 to {1000 * _SCALE_M:.0f} mm, dark: unseen"
+    cv2.putText(panel, text, (10, _PANEL_PX - 12), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)
+    return panel
+
+
+def _turn(image: _Picture) -> _Picture:
+    """An (H, W, 3) map of rows along y and columns along x as a panel with x up and y to the left."""
+    turned = np.ascontiguousarray(image.transpose(1, 0, 2)[::-1, ::-1])
+    width = round(turned.shape[1] * _PANEL_PX / turned.shape[0])
+    return np.asarray(cv2.resize(turned, (width, _PANEL_PX), interpolation=cv2.INTER_NEAREST), np.uint8)

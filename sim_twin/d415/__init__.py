@@ -1,0 +1,1 @@
+"""What a D415 sees: rays, shading, and the errors of the device."""

@@ -1,0 +1,222 @@
+"""The twin's UR5e: position-controlled joints of limited torque that follow trapezoidal profiles.
+
+It refuses what the controller refuses, and stops by itself where the controller does: on a contact force, on a joint
+that cannot follow, and when the supervisor falls silent.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.geometry import controller_ranges, rg2, ur5e
+from robotcell.geometry.transforms import Array, interpolate_transforms, invert_transform, rotation_angle
+from robotcell.interfaces import Arm, ArmMode, ArmState
+from sim_twin.devices.trajectory import slow_down, trapezoid
+from sim_twin.world import robot_model
+from sim_twin.world.world import STEP_S
+
+if TYPE_CHECKING:
+    from sim_twin.world.world import World
+
+# A stop brakes the tool at 10 m/s^2 (what ur_rtde passes to stopl), here 0.5 m from the joint that turns fastest.
+STOP_DECELERATION_RAD_S2 = 20.0
+# Universal Robots, factory safety preset of the UR5e: force limit.
+PROTECTIVE_FORCE_N = 150.0
+# A joint this far from where it should be could not follow: its motor is at its limit. Assumed.
+TRACKING_ERROR_RAD = 0.05
+WATCHDOG_S = 0.1
+# A motion that starts pressed against something may press this much more. Assumed.
+LEAVING_FORCE_N = 30.0
+
+# Share of the position error that each joint controller corrects within a step.
+JOINT_GAINS = (0.5,) * 6
+# A rotation counts as the way that the flange goes when it turns about the tcp: no end of the tool outruns the speed.
+ROTATION_LEVER_M = rg2.CLOSED_LENGTH_M
+
+_T_TCP_FLANGE = invert_transform(rg2.T_FLANGE_TCP)
+
+
+class TwinArm(Arm):
+    """The `Arm` of a world."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._connected = False
+        self._joints: list[int] = []
+        self._mode = ArmMode.READY
+        # The motion under way: (N, 6) joint angles, one per step, and the sample that was commanded last.
+        self._path: Array = np.empty((0, 6))
+        self._index = 0
+        self._braking = False
+        self._force_limit_n = PROTECTIVE_FORCE_N
+        self._kicked_at: float | None = None
+
+    def connect(self) -> None:
+        """Attach to the world and hold the arm where it is. Does nothing when connected."""
+        if self._connected:
+            return
+        try:
+            self._world.attach(self)
+            self._joints = self._world.joint_index(robot_model.ARM_JOINTS)
+            self._mode = ArmMode.READY
+            self._kicked_at = None
+            self._hold()
+            self._world.add_controller(self._control)
+            self._connected = True
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Stop the arm and let the world go. Idempotent, also when connecting was cut short."""
+        if self._connected:
+            self._hold()
+        self._connected = False
+        self._world.remove_controller(self._control)
+        self._world.detach(self)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a motion, or the braking that ends it, is under way."""
+        self._need_connection()
+        return self._index < len(self._path) - 1
+
+    def state(self) -> ArmState:
+        """The state after the last step.
+
+        The wrench is the sum of the contact forces on gripper and fingers, as the sensor in the flange reports them
+        once the gripper's own weight is subtracted: a held object's weight is in it, the arm's inertia is not.
+        """
+        self._need_connection()
+        q, qd = self._world.joint_states(self._joints)
+        T_base_tcp = ur5e.forward(q) @ rg2.T_FLANGE_TCP
+        return ArmState(
+            t=self._world.time_s,
+            q=q,
+            qd=qd,
+            T_base_tcp=T_base_tcp,
+            wrench=self._world.contact().tool_wrench(T_base_tcp[:3, 3]),
+            mode=self._mode,
+        )
+
+    def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Start a joint-space motion; see `Arm`.
+
+        Raises:
+            UnsafeMotion: q is outside the joint limits or not six finite numbers, speed or acceleration are outside
+                the controller's range, or the arm is moving.
+            DeviceFault: the arm is stopped.
+        """
+        self._need_ready()
+        target = controller_ranges.check_joint_motion(q, speed_rad_s, acceleration_rad_s2)
+        start = self._path[-1]
+        distance = float(np.abs(target - start).max())
+        s = trapezoid(distance, speed_rad_s, acceleration_rad_s2, STEP_S)
+        if len(s):
+            self._start(start + (s / distance)[:, None] * (target - start))
+
+    def start_linear(self, T_base_tcp: Array, speed_m_s: float, acceleration_m_s2: float) -> None:
+        """Start a straight motion of the tcp; see `Arm`.
+
+        Raises:
+            UnsafeMotion: the pose is no rigid transform, it or a pose on the way is out of reach or singular, a joint
+                would have to turn faster than it can, speed or acceleration are outside the controller's range, or
+                the arm is moving.
+            DeviceFault: the arm is stopped.
+        """
+        self._need_ready()
+        T_goal = controller_ranges.check_linear_motion(T_base_tcp, speed_m_s, acceleration_m_s2)
+        q = self._path[-1]
+        T_start = ur5e.forward(q) @ rg2.T_FLANGE_TCP
+        turn = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
+        distance = max(float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3])), turn * ROTATION_LEVER_M)
+        s = trapezoid(distance, speed_m_s, acceleration_m_s2, STEP_S)
+        if not len(s):
+            return
+        poses = interpolate_transforms(T_start, T_goal, s / distance) @ _T_TCP_FLANGE
+        try:
+            path = ur5e.inverse_along(poses, q, controller_ranges.BRANCH_STEP_RAD)
+        except ValueError as error:
+            raise UnsafeMotion(f"straight motion refused: {error}") from None
+        controller_ranges.check_joint_speeds(np.abs(np.diff(path, axis=0, prepend=q[None])) / STEP_S)
+        self._start(path)
+
+    def stop(self) -> None:
+        """Brake along the path at `STOP_DECELERATION_RAD_S2`."""
+        self._need_connection()
+        if self.moving and not self._braking:
+            rest = slow_down(self._path, self._index, STOP_DECELERATION_RAD_S2, STEP_S)
+            self._path = np.vstack([self._path[self._index], rest])
+            self._index = 0
+            self._braking = True
+
+    def kick(self) -> None:
+        """Arm the watchdog: from now on a motion stops when no kick comes for `WATCHDOG_S` of simulated time."""
+        self._need_connection()
+        self._kicked_at = self._world.time_s
+
+    def recover(self) -> None:
+        """Leave a protective stop; the next motion starts from where the joints are. Does nothing when ready."""
+        self._need_connection()
+        if self._mode is ArmMode.PROTECTIVE_STOP:
+            self._hold()
+            self._mode = ArmMode.READY
+
+    def _start(self, path: Array) -> None:
+        self._path = np.vstack([self._path[-1], path])
+        self._index = 0
+        self._braking = False
+        # More than at the start, so that the arm can leave a contact that stopped it.
+        at_start = _norm(self._world.contact().robot_force)
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + LEAVING_FORCE_N)
+        if self._kicked_at is not None:
+            self._kicked_at = self._world.time_s
+
+    def _control(self) -> None:
+        """One control period: watch, also an arm at rest; then command the next sample."""
+        if self._mode is ArmMode.READY and self._must_protect():
+            self._hold()
+            self._mode = ArmMode.PROTECTIVE_STOP
+        if self._index >= len(self._path) - 1:
+            return
+        if self._kicked_at is not None and self._world.time_s - self._kicked_at > WATCHDOG_S:
+            self.stop()
+            if self._index >= len(self._path) - 1:
+                return
+        self._index += 1
+        self._command(self._path[self._index])
+
+    def _must_protect(self) -> bool:
+        if _norm(self._world.contact().robot_force) > self._force_limit_n:
+            return True
+        q, _ = self._world.joint_states(self._joints)
+        return float(np.abs(q - self._path[self._index]).max()) > TRACKING_ERROR_RAD
+
+    def _hold(self) -> None:
+        q, _ = self._world.joint_states(self._joints)
+        self._path = q[None]
+        self._index = 0
+        self._braking = False
+        self._command(q)
+
+    def _command(self, q: Array) -> None:
+        self._world.drive_positions(self._joints, q.tolist(), robot_model.JOINT_TORQUE_NM, JOINT_GAINS)
+
+    def _need_connection(self) -> None:
+        if not self._connected:
+            raise ConnectionLost("the twin's arm is not connected: connect it first")
+
+    def _need_ready(self) -> None:
+        self._need_connection()
+        if self._mode is not ArmMode.READY:
+            raise DeviceFault(f"the arm is in {self._mode.value}: look at the cell, clear the contact, then recover")
+        if self.moving:
+            raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it")
+
+
+def _norm(vector: Array) -> float:
+    return math.sqrt(float(vector @ vector))

@@ -1,0 +1,141 @@
+"""The twin's D415: renders what the camera would see of the world, and degrades it as the device does."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import TYPE_CHECKING
+
+from robotcell.errors import ConnectionLost
+from robotcell.interfaces import Camera, RgbdFrame
+from sim_twin.d415.noise import WARM_UP_FRAMES, NoiseOptions
+from sim_twin.d415.rays import Indices, load_open3d
+from sim_twin.d415.renderer import FRAMES_PER_S, Floats, Renderer
+from sim_twin.wire.d415.stream import SERIAL
+from sim_twin.world.world import STEP_S
+
+if TYPE_CHECKING:
+    from robotcell.config.schema import CameraMount
+    from robotcell.geometry.transforms import Array
+    from sim_twin.world.world import World
+
+_STEPS_PER_FRAME = round(1 / (FRAMES_PER_S * STEP_S))
+
+
+class TwinCamera(Camera):
+    """A `Camera` that looks at a simulated world with the resolution, rate and errors of a D415.
+
+    Frames come at 30 Hz of simulated time: `read()` lets the world run on by one frame. `connect()` lets the
+    frames pass in which automatic exposure settles, as a driver of the device does. The frame number counts
+    from the beginning of the world.
+
+    Args:
+        world: what there is to see.
+        mount: resolution and place.
+        noise: which errors of the device to make.
+        seed: of the errors; the same seed at the same time gives the same frame.
+        T_base_camera: where it really stands (4, 4); where the mount has it without a calibration unless given.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        mount: CameraMount,
+        noise: NoiseOptions,
+        seed: int,
+        T_base_camera: Array | None = None,
+    ) -> None:
+        self._world = world
+        self._mount = mount
+        self._T_base_camera = mount.nominal() if T_base_camera is None else T_base_camera
+        self._noise = noise
+        self._seed = seed
+        self._first_frame: int | None = None
+        self._renderer: Renderer | None = None
+
+    def connect(self) -> None:
+        """Start the stream and wait until its exposure has settled.
+
+        Raises:
+            ConfigError: open3d is not installed, or the world cannot be built.
+            CalibrationError: the calibration is of another camera or another resolution.
+        """
+        if self._first_frame is not None:
+            return
+        if self._mount.measured is not None:
+            # Nobody leans on a simulated camera: its calibration does not age.
+            self._mount.measured.check(serial=SERIAL, resolution=self._mount.size, max_age=timedelta.max)
+        load_open3d()
+        self._world.attach(self)
+        try:
+            self._prepare()
+            self._first_frame = self._frame_number()
+            if self._noise.warm_up:
+                self._world.step(WARM_UP_FRAMES * _STEPS_PER_FRAME)
+        except BaseException:
+            self._first_frame = None
+            self._world.detach(self)
+            raise
+
+    def close(self) -> None:
+        """Stop the stream."""
+        if self._first_frame is not None:
+            self._first_frame = None
+            self._world.detach(self)
+        self._renderer = None
+
+    def read(self) -> RgbdFrame:
+        """The next frame.
+
+        Raises:
+            ConnectionLost: the camera is not connected.
+        """
+        return self.read_with_truth()[0]
+
+    def read_with_truth(self) -> tuple[RgbdFrame, Indices]:
+        """The next frame, and the index (H, W) into `world.visuals()` of what each pixel really shows, -1 = nothing.
+
+        Raises:
+            ConnectionLost: the camera is not connected.
+        """
+        first_frame = self._connected()
+        self._world.step(_STEPS_PER_FRAME)
+        t, number = self._world.time_s, self._frame_number()
+        renderer = self._prepare()
+        hits = renderer.cast(self._world.visual_poses())
+        frame = RgbdFrame(
+            t=t,
+            number=number,
+            color=renderer.measured_color(renderer.color(hits), number, t, number - first_frame),
+            depth_m=renderer.measured_depth(hits.depth_m, renderer.incidence_cos(hits), number),
+            intrinsics=renderer.intrinsics,
+            serial=SERIAL,
+        )
+        return frame, hits.visual()
+
+    def render_truth(self) -> tuple[Floats, Indices]:
+        """What is really in front of the camera now: for scores, labels and tests, never for a decision.
+
+        Returns:
+            Depth (H, W) [m] along the optical axis, 0 = nothing, and the index (H, W) into `world.visuals()`,
+            -1 = nothing. No noise, no limit of range, and no time passes.
+
+        Raises:
+            ConnectionLost: the camera is not connected.
+        """
+        self._connected()
+        hits = self._prepare().cast(self._world.visual_poses())
+        return hits.depth_m, hits.visual()
+
+    def _connected(self) -> int:
+        if self._first_frame is None:
+            raise ConnectionLost("the twin's camera is not connected; call connect() first")
+        return self._first_frame
+
+    def _frame_number(self) -> int:
+        return round(self._world.time_s / STEP_S) // _STEPS_PER_FRAME
+
+    def _prepare(self) -> Renderer:
+        visuals = self._world.visuals()
+        if self._renderer is None or visuals is not self._renderer.visuals:
+            self._renderer = Renderer(visuals, self._mount, self._noise, self._seed, self._T_base_camera)
+        return self._renderer

@@ -1,0 +1,1 @@
+"""What stands on the twin's table: solids, scenes, and scene files."""

@@ -1,0 +1,1 @@
+"""The served Compute Box with an RG2, over Modbus TCP."""

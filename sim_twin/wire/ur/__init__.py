@@ -1,0 +1,1 @@
+"""The served UR controller: RTDE, dashboard, URScript and the streams."""

@@ -1,0 +1,442 @@
+"""The UR controller itself: modes, safety, the running program and the arm, one control period at a time.
+
+It knows nothing of sockets. What is not public it assumes: how long power and brakes take, and that a protective or
+safeguard stop pauses the program.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim_twin.devices.arm import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
+from sim_twin.wire.ur.motion import PERIOD_S, Arm, ScriptError
+from sim_twin.wire.ur.variables import BIT_REGISTERS, REGISTERS
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Sequence
+
+    from robotcell.geometry.transforms import Array
+    from sim_twin.wire.ur.program import Program
+
+VERSION = (5, 12, 0, 1101319)
+SERIAL_NUMBER = "20225500001"
+MODEL = "UR5"
+
+# Universal Robots, script manual: a protective stop can be left after 5 s.
+UNLOCK_AFTER_S = 5.0
+# How long the joints take to boot, and the brakes to open. Assumed; the real ones take several seconds.
+_POWER_ON_S = 0.5
+_BRAKE_RELEASE_S = 0.5
+# How fast slider and pause change the speed, per second: an arm at full joint speed then brakes at 19 rad/s^2.
+_RATE_SLOPE = 6.0
+# What the arm does is compared with the targets of this many periods before it was measured: it follows with a delay.
+_TRACKING_PERIODS = 20
+_HISTORY_PERIODS = 500
+# When the world has not stepped for so long, the time of motions stands still too; the arm could not follow them.
+_WORLD_STALLS_S = 0.015
+# A force on the tool that counts as contact. Assumed; the real detection also looks at the motor currents.
+_CONTACT_FORCE_N = 10.0
+
+
+class RobotMode(enum.IntEnum):
+    """robot_mode of RTDE."""
+
+    NO_CONTROLLER = -1
+    DISCONNECTED = 0
+    CONFIRM_SAFETY = 1
+    BOOTING = 2
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    BACKDRIVE = 6
+    RUNNING = 7
+    UPDATING_FIRMWARE = 8
+
+
+class SafetyMode(enum.IntEnum):
+    """safety_mode of RTDE, as far as the twin knows them."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    SAFEGUARD_STOP = 5
+    ROBOT_EMERGENCY_STOP = 7
+    VIOLATION = 8
+
+
+class RuntimeState(enum.IntEnum):
+    """runtime_state of RTDE."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+    RESUMING = 5
+
+
+@dataclass
+class Registers:
+    """The general purpose registers."""
+
+    input_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    input_bit: list[bool] = field(default_factory=lambda: [False] * BIT_REGISTERS)
+    output_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
+    output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
+    output_bit: list[bool] = field(default_factory=lambda: [False] * BIT_REGISTERS)
+
+
+@dataclass
+class Payload:
+    """What the arm carries: mass [kg], centre of gravity in the flange [m], inertia [kg m^2]."""
+
+    mass: float = 0.0
+    cog: tuple[float, ...] = (0.0, 0.0, 0.0)
+    inertia: tuple[float, ...] = (0.0,) * 6
+
+
+@dataclass
+class Outputs:
+    """What the control box puts out: digital lines (standard 0-7, configurable 8-15, tool 16-17) and two analog ones.
+
+    Analog values are shares of the range: 4-20 mA or, where the bit in `analog_types` is set, 0-10 V.
+    """
+
+    digital: int = 0
+    analog: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    analog_types: int = 0
+
+
+@dataclass
+class Watchdog:
+    """rtde_set_watchdog: the program ends when an input variable is not written in time."""
+
+    variable: str
+    period_s: float
+    written_at: float
+
+
+class Controller:
+    """The controller of one arm.
+
+    Args:
+        q: (6,) joint angles [rad] at the start.
+
+    Attributes:
+        time: seconds since the controller started.
+        execution_time: how long the whole last period took its process [s].
+        notes: (title, text) of what happened, for the clients that read messages; the server takes them out.
+        remote: whether the pendant is in remote control.
+        slider: the speed slider, 0 to 1.
+        loaded: the program file that the pendant has loaded.
+        program: that runs, or is paused.
+    """
+
+    def __init__(self, q: Array) -> None:
+        self.arm = Arm(q)
+        self.registers = Registers()
+        self.outputs = Outputs()
+        self.payload = Payload()
+        self.gravity: tuple[float, ...] = (0.0, 0.0, 9.82)
+        self.time = 0.0
+        self.execution_time = 0.0
+        self.ticks = 0
+        self.notes: deque[tuple[str, str]] = deque(maxlen=100)
+        self.remote = True
+        self.slider = 1.0
+        self.loaded: str | None = None
+        self.program: Program | None = None
+        self.watchdog: Watchdog | None = None
+        self.robot_mode = RobotMode.RUNNING
+        self.safety_mode = SafetyMode.NORMAL
+        self.runtime = RuntimeState.STOPPED
+        self.popup: str | None = None
+        # What a fault holds as it is.
+        self.frozen_slider: float | None = None
+        self.tcp_frozen = False
+        self.payload_frozen = False
+        self._rate = 1.0
+        self._force_n = 0.0
+        self._power_at: float | None = None
+        self._brakes_at: float | None = None
+        self._stopped_at = -math.inf
+        self._force_limit_n = PROTECTIVE_FORCE_N
+        self._targets = np.tile(self.arm.q, (64, 1))
+        # Measured joint angles and forces on the tool, newest last.
+        self.joint_history: deque[Array] = deque([self.arm.q], maxlen=_HISTORY_PERIODS)
+        self._force_history: deque[Array] = deque([np.zeros(3)], maxlen=_HISTORY_PERIODS)
+
+    # What the arm does
+
+    def tick(self, now: float, cell: np.void) -> None:
+        """One control period.
+
+        Args:
+            now: time.monotonic() [s].
+            cell: the newest CELL_STATE.
+        """
+        self.ticks += 1
+        self.time = self.ticks * PERIOD_S
+        self._measure(cell)
+        self._switch_power()
+        self._watch_safety(now - float(cell["wall"]))
+        self._watch_client()
+        self._set_rate(now - float(cell["wall"]))
+        was_steady = self.arm.steady
+        if self.program is not None and self.runtime in (RuntimeState.PLAYING, RuntimeState.PAUSING):
+            self._run_program(self.program)
+        if not self.powered:
+            self.arm.hold()
+        self.arm.finish_period()
+        if was_steady and not self.arm.steady:
+            self._allow_leaving(cell)
+        self._targets[self.ticks % len(self._targets)] = self.arm.q
+
+    def skip(self, ticks: int) -> None:
+        """Let time pass without doing anything: the process was held up."""
+        self.ticks += ticks
+        self._targets[:] = self.arm.q
+        if self.watchdog is not None:
+            self.watchdog.written_at += ticks * PERIOD_S
+
+    @property
+    def powered(self) -> bool:
+        """Whether the joints hold or follow the target; else the brakes hold them."""
+        return self.robot_mode is RobotMode.RUNNING
+
+    @property
+    def safe(self) -> bool:
+        """Whether no safety function has stopped the arm."""
+        return self.safety_mode is SafetyMode.NORMAL
+
+    @property
+    def speed_fraction(self) -> float:
+        """What the speed slider stands at."""
+        return self.slider if self.frozen_slider is None else self.frozen_slider
+
+    def contact_steps(self, direction: Sequence[float]) -> int:
+        """How many periods ago the tool came into contact; 0 when it is free. tool_contact.
+
+        Args:
+            direction: (at least 3) base axes, against which a contact pushes; zeros for any.
+        """
+        axis = np.array(direction[:3], dtype=np.float64)
+        length = float(np.linalg.norm(axis))
+        steps = 0
+        for force in reversed(self._force_history):
+            size = -float(force @ axis) / length if length > 0 else float(np.linalg.norm(force))
+            if size < _CONTACT_FORCE_N:
+                break
+            steps += 1
+        return steps
+
+    def joints_before(self, steps: int) -> Array:
+        """Joint angles (6,) measured some periods ago. get_actual_joint_positions_history."""
+        return self.joint_history[max(-1 - max(steps, 0), -len(self.joint_history))]
+
+    # What the program is told
+
+    def listens(self) -> bool:
+        """Whether scripts from outside are taken."""
+        if not self.remote:
+            self.note("Program rejected", "the robot is in local control: switch the pendant to remote control")
+        return self.remote
+
+    def start(self, program: Program) -> bool:
+        """Run a program instead of the one that runs; whether the controller takes it."""
+        if not self.listens():
+            return False
+        if not self.powered or not self.safe:
+            self.note("Program rejected", f"the robot is in {self.robot_mode.name}, {self.safety_mode.name}")
+            return False
+        self.stop_program()
+        self.program = program
+        self.runtime = RuntimeState.PLAYING
+        self.note("PROGRAM_XXX_STARTED", program.name)
+        return True
+
+    def stop_program(self, reason: str | None = None) -> None:
+        """End the program; the arm brakes. Does nothing when none runs."""
+        if reason is not None:
+            self.note("Program stopped", reason)
+        if self.program is None:
+            return
+        self.note("PROGRAM_XXX_STOPPED", self.program.name)
+        self.program = None
+        self.watchdog = None
+        self.arm.freedrive = False
+        self.arm.force_mode = None
+        self.runtime = RuntimeState.STOPPED
+
+    def pause_program(self) -> bool:
+        """Bring the arm to a standstill on its path and the program with it; whether one runs."""
+        if self.runtime is not RuntimeState.PLAYING:
+            return self.runtime is RuntimeState.PAUSED
+        self.runtime = RuntimeState.PAUSING
+        return True
+
+    def resume_program(self) -> bool:
+        """Go on with a paused program; whether that is possible."""
+        if self.runtime is not RuntimeState.PAUSED or not self.powered or not self.safe:
+            return False
+        self.runtime = RuntimeState.PLAYING
+        return True
+
+    def wrote(self, names: Container[str]) -> None:
+        """Take note that a client has written some input variables."""
+        if self.watchdog is not None and self.watchdog.variable in names:
+            self.watchdog.written_at = self.time
+
+    def note(self, title: str, text: str) -> None:
+        """Tell the clients that read messages."""
+        self.notes.append((title, text))
+
+    def set_tcp(self, tcp: Sequence[float]) -> None:
+        """Take another tool centre point."""
+        if not self.tcp_frozen:
+            self.arm.set_tcp(tcp)
+
+    def set_payload(self, payload: Payload) -> None:
+        """Take another payload."""
+        if not self.payload_frozen:
+            self.payload = payload
+
+    # What the operator and the safety system do
+
+    def power_on(self) -> None:
+        """Boot the joints; takes a while."""
+        if self.robot_mode is RobotMode.POWER_OFF and self.safety_mode in (
+            SafetyMode.NORMAL,
+            SafetyMode.SAFEGUARD_STOP,
+        ):
+            self.robot_mode = RobotMode.POWER_ON
+            self._power_at = self.time + _POWER_ON_S
+
+    def power_off(self) -> None:
+        """Cut the power; the brakes fall in."""
+        self.stop_program()
+        self._power_at = self._brakes_at = None
+        self.robot_mode = RobotMode.POWER_OFF
+
+    def release_brakes(self) -> None:
+        """Open the brakes, after powering on where that has not been done."""
+        self.power_on()
+        if self.robot_mode in (RobotMode.POWER_ON, RobotMode.IDLE):
+            begin = self.time if self._power_at is None else self._power_at
+            self._brakes_at = begin + _BRAKE_RELEASE_S
+
+    def protective_stop(self, reason: str) -> None:
+        """Stop at once, for good until it is unlocked; the program is paused."""
+        if self.safety_mode is not SafetyMode.NORMAL:
+            return
+        self.safety_mode = SafetyMode.PROTECTIVE_STOP
+        self._stopped_at = self.time
+        self.arm.hold()
+        self._halt_program()
+        self.popup = reason
+        self.note("Protective stop", reason)
+
+    def unlock_protective_stop(self) -> bool:
+        """Leave a protective stop; False before `UNLOCK_AFTER_S`. The program stays paused."""
+        if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
+            return True
+        if self.time - self._stopped_at < UNLOCK_AFTER_S:
+            return False
+        self.safety_mode = SafetyMode.NORMAL
+        # Somebody may have moved the arm meanwhile.
+        self.arm.hold()
+        self._targets[:] = self.arm.q
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, self._force_n + LEAVING_FORCE_N)
+        return True
+
+    def safeguard_stop(self) -> None:
+        """Stop on the path as long as the safeguard input is open."""
+        if self.safe:
+            self.safety_mode = SafetyMode.SAFEGUARD_STOP
+            self.pause_program()
+
+    def emergency_stop(self, mode: SafetyMode = SafetyMode.ROBOT_EMERGENCY_STOP) -> None:
+        """Stop, cut the power and end the program. The button is pressed, or a safety limit was violated."""
+        self.safety_mode = mode
+        self.power_off()
+
+    def restart_safety(self) -> None:
+        """Leave a violation; the arm is without power then."""
+        if self.safety_mode is SafetyMode.VIOLATION:
+            self.safety_mode = SafetyMode.NORMAL
+
+    def boot(self) -> None:
+        """Be as a controller that has just been switched on."""
+        self.power_off()
+        self.robot_mode = RobotMode.BOOTING
+
+    def restore(self) -> None:
+        """Be ready again, as after all that an operator does at the pendant."""
+        self.safety_mode = SafetyMode.NORMAL
+        self._power_at = self._brakes_at = None
+        self.robot_mode = RobotMode.RUNNING
+
+    def _measure(self, cell: np.void) -> None:
+        self.arm.measure(cell["q"], cell["qd"], cell["wrench"])
+        self._force_n = math.hypot(*cell["robot_force"].tolist())
+        self.joint_history.append(self.arm.measured_q)
+        self._force_history.append(self.arm.tcp_wrench[:3])
+
+    def _switch_power(self) -> None:
+        if self._power_at is not None and self.time >= self._power_at:
+            self.robot_mode, self._power_at = RobotMode.IDLE, None
+        if self._brakes_at is not None and self.time >= self._brakes_at:
+            self.robot_mode, self._brakes_at = RobotMode.RUNNING, None
+
+    def _watch_safety(self, age: float) -> None:
+        if not self.powered or self.safety_mode is SafetyMode.PROTECTIVE_STOP:
+            return
+        if self._force_n > self._force_limit_n:
+            self.protective_stop(f"the arm was pushed with {self._force_n:.0f} N")
+            return
+        # The targets of the periods just before the measurement.
+        newest = self.ticks - 1 - min(round(age / PERIOD_S), len(self._targets) - _TRACKING_PERIODS - 1)
+        window = self._targets[np.arange(newest - _TRACKING_PERIODS, newest + 1) % len(self._targets)]
+        q = self.arm.measured_q
+        error = float(np.maximum(window.min(axis=0) - q, q - window.max(axis=0)).max())
+        if error > TRACKING_ERROR_RAD:
+            self.protective_stop(f"a joint is {error:.2f} rad from where it should be")
+
+    def _watch_client(self) -> None:
+        dog = self.watchdog
+        if dog is not None and self.runtime is RuntimeState.PLAYING and self.time - dog.written_at > dog.period_s:
+            self.stop_program(f"the watchdog of {dog.variable} has not been served for {dog.period_s:.3f} s")
+
+    def _set_rate(self, age: float) -> None:
+        wanted = 0.0 if self.runtime in (RuntimeState.PAUSING, RuntimeState.PAUSED) else self.speed_fraction
+        step = _RATE_SLOPE * PERIOD_S
+        self._rate = min(max(wanted, self._rate - step), self._rate + step)
+        self.arm.rate = 0.0 if age > _WORLD_STALLS_S else self._rate
+        if self.runtime is RuntimeState.PAUSING and self._rate == 0:
+            self.arm.rest()
+            self.runtime = RuntimeState.PAUSED
+
+    def _run_program(self, program: Program) -> None:
+        try:
+            running = program.step()
+        except ScriptError as error:
+            self.stop_program(str(error))
+            return
+        if not running:
+            self.stop_program()
+
+    def _halt_program(self) -> None:
+        if self.program is not None:
+            self.runtime = RuntimeState.PAUSED
+            self._rate = 0.0
+
+    def _allow_leaving(self, cell: np.void) -> None:
+        """Let an arm that starts to move press a little more than at the start, so that it can leave a contact."""
+        at_start = float(np.linalg.norm(cell["robot_force"]))
+        self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + LEAVING_FORCE_N)

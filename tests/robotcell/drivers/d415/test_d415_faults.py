@@ -1,0 +1,206 @@
+"""The D415's driver and what looks through it, while a served camera fails in every way that it can."""
+
+import json
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from robotcell.cell import Cell
+from robotcell.config.calibration_file import CameraCalibration
+from robotcell.config.schema import CameraMount, load_config
+from robotcell.drivers.clock import WallClock
+from robotcell.drivers.d415 import camera as d415
+from robotcell.drivers.d415.camera import D415, D415Options
+from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
+from robotcell.jobs.job import look
+from sim_twin.wire.d415.server import FAULTS, WRONG_SERIAL
+from sim_twin.wire.d415.stream import SERIAL
+from sim_twin.wire.faults import Kind
+from tests.robotcell.config.test_calibration_file import values
+from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE, ServedCamera
+
+OFF, STUCK, SLOW, DELAYED, INTERMITTENT = Kind.OFF, Kind.STUCK, Kind.SLOW, Kind.DELAYED, Kind.INTERMITTENT
+WRONG, GARBAGE = Kind.WRONG, Kind.GARBAGE
+# What a look at the table comes to while the stream runs: each fault, its number, the error and its words.
+WHILE_STREAMING = [
+    ("stream", OFF, "", None, ConnectionLost, "no frame came within 1 s"),
+    ("stream", STUCK, "", None, DeviceFault, "frozen"),
+    ("stream", SLOW, "", 0.02, ConnectionLost, "no frame came within 1 s"),
+    ("stream", DELAYED, "", 3.0, (DeviceFault, ConnectionLost), "old|no frame came"),
+    ("stream", INTERMITTENT, "", 60.0, ConnectionLost, "no frame came within 1 s"),
+    ("stream", WRONG, "serial", None, ConnectionLost, "no frame came within 1 s"),
+    ("stream", WRONG, "resolution", None, ConnectionLost, "no frame came within 1 s"),
+    ("stream", WRONG, "usb2", None, ConnectionLost, "no frame came within 1 s"),
+    ("depth", GARBAGE, "", None, DeviceFault, "nothing in the image has depth"),
+    ("depth", WRONG, "scale", 10.0, DeviceFault, "sees 0% of the workspace"),
+    ("depth", WRONG, "tilt", 0.05, CalibrationError, "tilted"),
+    ("depth", WRONG, "holes", 0.9, DeviceFault, "of the workspace"),
+    ("color", GARBAGE, "", None, DeviceFault, "black"),
+    ("color", DELAYED, "", 0.5, DeviceFault, "apart"),
+]
+# What connecting comes to. A slow stream needs two seconds for three frames, so it is not among them.
+WHILE_CONNECTING = [
+    ("stream", OFF, "", None, ConnectionLost, "robotcell twin serve"),
+    ("stream", STUCK, "", None, DeviceFault, "frozen"),
+    ("stream", DELAYED, "", 1.5, DeviceFault, "old"),
+    ("stream", INTERMITTENT, "", 60.0, ConnectionLost, "robotcell twin serve"),
+    ("stream", WRONG, "serial", None, ConnectionLost, f"{SERIAL} is not connected, only {WRONG_SERIAL}"),
+    ("stream", WRONG, "resolution", None, DeviceFault, r"camera\.resolution"),
+    ("stream", WRONG, "usb2", None, DeviceFault, r"USB 2\.1"),
+    ("depth", GARBAGE, "", None, DeviceFault, "nothing in the image has depth"),
+    ("color", GARBAGE, "", None, DeviceFault, "black"),
+    ("color", DELAYED, "", 0.5, DeviceFault, "apart"),
+]
+LIMIT_S = 20.0
+# A second is what the driver waits for; the machine may be busy.
+SOON_S = 10.0
+
+
+@pytest.fixture(scope="module")
+def served():
+    with ServedCamera("127.0.0.36", overrides=WITHOUT_NOISE) as camera:
+        yield camera
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """The exposure of this camera has nothing to settle."""
+    monkeypatch.setattr(d415, "_WARM_UP_FRAMES", 3)
+
+
+@pytest.fixture(autouse=True)
+def lift(served):
+    yield
+    served.inject()
+
+
+def driver(served, serial=SERIAL, **mount):
+    return D415(D415Options(source=served.source, serial=serial), CameraMount(**mount), WallClock())
+
+
+def connect(camera):
+    """Connect as soon as the camera is back."""
+    end = time.monotonic() + LIMIT_S
+    while True:
+        try:
+            return camera.connect()
+        except CellError:
+            if time.monotonic() > end:
+                raise
+        time.sleep(0.05)
+
+
+def again_and_again(do):
+    """Until it fails, which each time takes no longer than the driver waits for."""
+    end = time.monotonic() + LIMIT_S
+    while (begun := time.monotonic()) < end:
+        try:
+            do()
+        except CellError:
+            assert time.monotonic() - begun < SOON_S
+            raise
+
+
+def looking(camera):
+    """A cell whose arm stands at home and whose camera this is."""
+    config = load_config()
+    arm = SimpleNamespace(state=lambda: SimpleNamespace(q=np.array(config.motion.home_q)))
+    return Cell(config, arm, SimpleNamespace(), camera, WallClock())
+
+
+def names(rows):
+    return [f"{channel} {kind.value} {what}".strip() for channel, kind, what, *_ in rows]
+
+
+def test_every_fault_that_the_camera_declares_is_tried():
+    assert {tuple(row[:3]) for row in WHILE_STREAMING} == FAULTS
+
+
+@pytest.mark.parametrize("row", WHILE_STREAMING, ids=names(WHILE_STREAMING))
+def test_a_fault_while_the_stream_runs_is_an_error_and_passes(served, row):
+    *fault, error, words = row
+    with driver(served) as camera:
+        cell = looking(camera)
+        look(cell)
+        served.inject(tuple(fault))
+        with pytest.raises(error, match=words):
+            again_and_again(lambda: look(cell))
+    served.inject()
+    connect(camera)
+    look(cell)
+    camera.close()
+
+
+@pytest.mark.parametrize("row", WHILE_CONNECTING, ids=names(WHILE_CONNECTING))
+def test_a_fault_while_connecting_is_an_error_and_passes(served, row):
+    *fault, error, words = row
+    camera = driver(served)
+    with camera:
+        served.inject(tuple(fault))
+        camera.close()
+        # The camera is plugged in anew at some moment from now on.
+        time.sleep(0.3)
+        with pytest.raises(error, match=words):
+            again_and_again(lambda: camera.close() or camera.connect())
+    served.inject()
+    connect(camera)
+    camera.read()
+    camera.close()
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [("stream", SLOW, "", 0.3), ("stream", DELAYED, "", 0.2), ("depth", WRONG, "holes", 0.2)],
+    ids=["slow", "late", "holes"],
+)
+def test_what_can_be_lived_with_is(served, fault):
+    with driver(served) as camera:
+        served.inject(fault)
+        time.sleep(0.2)
+        cell = looking(camera)
+        views = [look(cell) for _ in range(3)]
+    assert (np.diff([view.frame.number for view in views]) > 0).all()
+
+
+def test_a_server_that_dies_is_lost_and_its_successor_is_found(served):
+    with ServedCamera("127.0.0.37", overrides=WITHOUT_NOISE) as mortal, driver(mortal) as camera:
+        camera.read()
+        mortal.process.kill()
+        with pytest.raises(ConnectionLost, match="no frame came"):
+            again_and_again(camera.read)
+        camera.close()
+        with pytest.raises(ConnectionLost, match="robotcell twin serve"):
+            camera.connect()
+        mortal.end()
+        assert "camera" in mortal.start()
+        connect(camera)
+        camera.read()
+
+
+def calibration(tmp_path, **camera):
+    path = tmp_path / "camera.json"
+    optics = {"width": 640, "height": 480, "fx": 617, "fy": 617, "cx": 320, "cy": 240, "serial": SERIAL, **camera}
+    path.write_text(json.dumps(values(camera=optics, date="2026-11-01T12:00:00Z")))
+    assert CameraCalibration.model_validate_json(path.read_text())
+    return path
+
+
+def test_the_calibration_must_be_of_this_camera(served, tmp_path):
+    with driver(served, calibration=calibration(tmp_path)) as camera:
+        camera.read()
+    for change, words in (({"serial": "424242"}, f"424242, and {SERIAL}"), ({"width": 1280}, "1280x480, and 640x480")):
+        with pytest.raises(CalibrationError, match=words):
+            driver(served, calibration=calibration(tmp_path, **change)).connect()
+
+
+def test_a_frame_shows_what_the_camera_sees_with_settled_exposure(monkeypatch):
+    monkeypatch.undo()
+    with ServedCamera("127.0.0.38") as noisy, driver(noisy, serial=None) as camera:
+        first = camera.read()
+        later = [camera.read() for _ in range(5)][-1]
+    assert first.color.mean() == pytest.approx(later.color.mean(), rel=0.02)
+    assert first.serial == SERIAL
+    T = noisy.config.camera.pose()
+    assert np.median(first.depth_m[220:260, 300:340]) == pytest.approx(-T[2, 3] / T[2, 2], abs=0.06)

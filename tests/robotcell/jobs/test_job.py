@@ -1,0 +1,418 @@
+"""Jobs in the twin, judged against what the simulator knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from policy import make_policy
+from robotcell.cell import Cell, open_cell
+from robotcell.config.schema import CellConfig, load_config
+from robotcell.errors import CalibrationError, DeviceFault, GuardTripped, NoTarget
+from robotcell.jobs import job as jobs
+from robotcell.jobs.job import Decision, Outcome, Report, Result, View, judge, look, run_job
+from robotcell.jobs.journal import Journal
+from robotcell.jobs.policy_api import Action, Observation, Primitive
+from robotcell.motion.executor import Ending, Execution, Executor
+from robotcell.motion.path_check import CheckedPlan, check_plan
+from robotcell.motion.plan import plan_action
+from robotcell.perception.segmentation import Instance, Segmentation, find_goal
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+SCENE = """
+name = "two cubes"
+drop = false
+
+[[object]]
+name = "goal"
+shape = "cube"
+color = "red"
+position = [0.0, 0.06, 0.025]
+
+[[object]]
+name = "other"
+shape = "cube"
+color = "blue"
+position = [0.0, -0.06, 0.025]
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> CellConfig:
+    scene = tmp_path / "two-cubes.toml"
+    scene.write_text(SCENE)
+    return load_config(None, {"backend.options.scene": str(scene), "journal.runs": str(tmp_path / "runs")})
+
+
+@dataclass
+class Scripted:
+    """A policy whose actions are functions of what it sees."""
+
+    script: list[Callable[[Observation], Action]]
+    name: str = "scripted"
+    seen: list[Observation] = field(default_factory=list)
+
+    def decide(self, observation: Observation) -> Action:
+        self.seen.append(observation)
+        if not self.script:
+            raise NoTarget("the script is over")
+        return self.script.pop(0)(observation)
+
+
+def grasp_at(x: float, y: float, z: float = 0.05, rotation: int = 0) -> Callable[[Observation], Action]:
+    def act(observation: Observation) -> Action:
+        row, col = observation.heightmap.workspace.cell(x, y)
+        return Action(Primitive.GRASP, row, col, rotation, (x, y, z), 1.0)
+
+    return act
+
+
+RED, BLUE = (-0.5, 0.06), (-0.5, -0.06)
+
+
+def run(config: CellConfig, policy: Scripted, goals: tuple[str, ...] | None) -> tuple[Report, list[Result], Journal]:
+    results: list[Result] = []
+
+    class Collector:
+        def started(self, job_id: int, run_dir: Path) -> None: ...
+
+        def looked(self, view: View) -> None: ...
+
+        def decided(self, decision: Decision) -> None: ...
+
+        def ended(self, decision: Decision, outcome: Outcome) -> None:
+            results.append(outcome.result)
+
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        report = run_job(cell, policy, journal, goals, (Collector(),))
+    return report, results, journal
+
+
+def test_a_goal_is_picked_and_confirmed(config: CellConfig) -> None:
+    report, results, _ = run(config, Scripted([grasp_at(*RED)]), ("red",))
+    assert results == [Result.PICKED]
+    assert report.completed
+    assert report.metrics.picked == ("red",)
+    assert sorted(path.name for path in (report.run_dir / "frames").iterdir())
+
+
+def test_a_wrong_object_counts_as_wrong(config: CellConfig) -> None:
+    report, results, _ = run(config, Scripted([grasp_at(*BLUE)]), ("red",))
+    assert results == [Result.WRONG_OBJECT]
+    assert not report.completed
+    assert report.metrics.grasp_successes == 0
+    assert report.metrics.picked == ("blue",)
+
+
+def test_an_empty_grasp_is_missed_and_barred(config: CellConfig) -> None:
+    policy = Scripted([grasp_at(-0.4, 0.0), grasp_at(*RED)])
+    report, results, _ = run(config, policy, ("red",))
+    assert results == [Result.MISSED, Result.PICKED]
+    assert [len(observation.barred) for observation in policy.seen] == [0, 1]
+    assert report.completed
+
+
+def test_a_finger_on_an_object_ends_the_descent(config: CellConfig) -> None:
+    # The finger comes down on the middle of the cube.
+    x = RED[0] - config.gripper.preshape_m / 2
+    report, results, _ = run(config, Scripted([grasp_at(x, RED[1])]), ("red",))
+    assert results == [Result.COLLIDED]
+    assert not report.completed
+
+
+def test_fingers_that_press_too_hard_as_they_close_open_again(config: CellConfig) -> None:
+    config = config.model_copy(update={"motion": config.motion.model_copy(update={"closing_force_n": 1.0})})
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        report = run_job(cell, Scripted([grasp_at(RED[0] - 0.01, RED[1])]), journal, ("red",))
+        (row,) = journal.job(report.job_id).actions
+        assert row.outcome is not None
+        assert row.outcome.result == Result.COLLIDED.value
+        assert "during 'close'" in row.outcome.detail
+        assert cell.gripper.state().width_m == pytest.approx(config.gripper.preshape_m, abs=0.002)
+        find_goal(look(cell).segmentation, "red")
+
+
+def test_an_unsafe_action_is_refused_and_nothing_moves(config: CellConfig) -> None:
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        q = cell.arm.state().q
+        report = run_job(cell, Scripted([grasp_at(-1.4, 0.0)] * 1), journal, ("red",))
+        np.testing.assert_allclose(cell.arm.state().q, q, atol=1e-3)
+        (row,) = journal.job(report.job_id).actions
+    assert row.outcome is not None
+    assert row.outcome.result == "refused"
+    assert "cannot reach" in row.outcome.detail
+
+
+def test_ten_failures_in_a_row_end_the_run(config: CellConfig) -> None:
+    report, results, _ = run(config, Scripted([grasp_at(-1.4, 0.0)] * 20), ("red",))
+    assert results == [Result.REFUSED] * 10
+    assert "10 failed attempts in a row" in report.reason
+
+
+def test_five_pushes_in_a_row_are_the_most(config: CellConfig) -> None:
+    policy = Scripted([push_at(-0.6, -0.15)] * 5 + [grasp_at(*RED)])
+    run(config, policy, ("red",))
+    assert [observation.may_push for observation in policy.seen] == [True] * 5 + [False]
+
+
+def test_a_goal_that_is_not_there_ends_the_job_and_lists_what_is(config: CellConfig) -> None:
+    report, results, _ = run(config, Scripted([grasp_at(*RED)]), ("red", "green"))
+    assert results == [Result.PICKED]
+    assert not report.completed
+    assert report.reason == "no green object is seen on the table; there is: blue"
+
+
+def push_at(x: float, y: float, z: float = 0.05, rotation: int = 0) -> Callable[[Observation], Action]:
+    def act(observation: Observation) -> Action:
+        row, col = observation.heightmap.workspace.cell(x, y)
+        return Action(Primitive.PUSH, row, col, rotation, (x, y, z), 1.0)
+
+    return act
+
+
+def hide_goal(monkeypatch: pytest.MonkeyPatch, looks: set[int]) -> None:
+    """At these looks, counted from 0, the goal is not seen; what lies there is."""
+    count = iter(range(100))
+
+    def find(segmentation: Segmentation, color: str) -> Instance:
+        if next(count) in looks:
+            raise NoTarget(f"no {color} object is seen on the table")
+        return find_goal(segmentation, color)
+
+    monkeypatch.setattr(jobs, "find_goal", find)
+
+
+def test_what_hides_a_goal_is_pushed_aside_and_never_picked(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hide_goal(monkeypatch, {1, 2})
+    # Beside red, along red to where blue stands, and back.
+    pushes = [push_at(-0.6, 0.06, rotation=12), push_at(-0.6, 0.0), push_at(-0.6, 0.0)]
+    policy = Scripted([*pushes, grasp_at(*RED)])
+    report, results, _ = run(config, policy, ("red",))
+    assert [observation.may_grasp for observation in policy.seen] == [True, False, False, True]
+    assert report.completed, (report.reason, results)
+    for observation in policy.seen[1:3]:
+        assert observation.may_push
+        assert observation.goal is not None
+        # What stands where the goal may have gone is what may lie on it.
+        assert observation.goal[observation.heightmap.workspace.cell(*RED)]
+
+
+def test_a_hidden_goal_is_searched_for_by_ten_pushes(config: CellConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    hide_goal(monkeypatch, set(range(1, 50)))
+    monkeypatch.setattr(jobs, "judge", lambda *_: Outcome(Result.PUSHED, None, "it moved", 0.0))
+    policy = Scripted([push_at(-0.6, -0.15)] * 20)
+    report, _, _ = run(config, policy, ("red",))
+    assert [observation.may_grasp for observation in policy.seen] == [True] + [False] * 10
+    assert all(observation.may_push for observation in policy.seen)
+    assert "10 failed attempts in a row" in report.reason
+
+
+@pytest.mark.parametrize(("x", "carried"), [(-0.55, True), (-0.65, False)], ids=["beside it", "far from it"])
+def test_a_hidden_goal_is_looked_for_where_a_push_may_have_taken_it(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch, x: float, carried: bool
+) -> None:
+    hide_goal(monkeypatch, {1})
+    # 0.1 m in the direction of -y, past both cubes: from red's place the way reaches blue.
+    policy = Scripted([push_at(x, 0.06, rotation=12)])
+    run(config, policy, ("red",))
+    goal = policy.seen[1].goal
+    assert goal is not None
+    workspace = policy.seen[1].heightmap.workspace
+    assert goal[workspace.cell(*RED)]
+    assert goal[workspace.cell(*BLUE)] == carried
+
+
+def test_a_goal_that_was_lost_on_its_way_is_not_searched_for(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hide_goal(monkeypatch, {1})
+    monkeypatch.setattr(jobs, "judge", lambda *_: Outcome(Result.LOST, None, "dropped", 0.0))
+    policy = Scripted([grasp_at(-0.4, 0.0)] * 2)
+    report, results, _ = run(config, policy, ("red",))
+    assert results == [Result.LOST]
+    assert report.reason == "no red object is seen on the table"
+
+
+def test_two_looks_at_an_untouched_heap_show_no_push() -> None:
+    crowded = load_config(None, {"backend.options.objects": 30, "backend.options.seed": 1})
+    with open_cell(crowded) as cell:
+        view = look(cell)
+        push = Action(Primitive.PUSH, 0, 0, 0, (-0.72, -0.22, 0.05), 1.0)
+        outcome = judge(Decision(1, None, view, push), look(cell), Execution(Ending.DONE, "home", 0.0, float("nan")))
+    assert outcome.result is Result.NOTHING_MOVED
+
+
+def test_pushes_do_not_excuse_failed_grasps(config: CellConfig) -> None:
+    def push(observation: Observation) -> Action:
+        row, col = observation.heightmap.workspace.cell(-0.58, -0.06)
+        return Action(Primitive.PUSH, row, col, 0, (-0.58, -0.06, 0.05), 1.0)
+
+    report, results, _ = run(config, Scripted([push, grasp_at(-1.4, 0.0)] * 40), ("red",))
+    assert results.count(Result.REFUSED) + results.count(Result.NOTHING_MOVED) == 10
+    assert Result.PUSHED in results
+    assert "10 failed attempts" in report.reason
+
+
+def test_everything_is_picked_in_any_order(config: CellConfig) -> None:
+    policy = make_policy("heuristic", config)
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        report = run_job(cell, policy, journal, None)
+    assert report.completed
+    assert sorted(report.metrics.picked) == ["blue", "red"]
+
+
+def test_goals_are_picked_in_their_order(config: CellConfig) -> None:
+    policy = make_policy("heuristic", config)
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        report = run_job(cell, policy, journal, ("blue", "red"))
+        goals = [row.goal for row in journal.job(report.job_id).actions]
+    assert report.metrics.picked == ("blue", "red")
+    assert goals == sorted(goals, key=str)
+
+
+def test_a_table_elsewhere_is_refused(config: CellConfig) -> None:
+    lower = config.model_copy(update={"table": config.table.model_copy(update={"height_m": 0.0})})
+    with open_cell(lower) as cell:
+        moved = Cell(
+            config.model_copy(update={"table": config.table.model_copy(update={"height_m": 0.02})}),
+            cell.arm,
+            cell.gripper,
+            cell.camera,
+            cell.clock,
+        )
+        with pytest.raises(CalibrationError, match=r"-20\.\d mm off"):
+            look(moved)
+
+
+def test_a_blind_camera_is_refused(config: CellConfig) -> None:
+    with open_cell(config) as cell:
+        # Beside the table there is nothing to see.
+        aside = config.model_copy(update={"workspace": config.workspace.model_copy(update={"y": (-1.4, -1.0)})})
+        with pytest.raises(DeviceFault, match="of the workspace"):
+            look(Cell(aside, cell.arm, cell.gripper, cell.camera, cell.clock))
+
+
+def grasp_plan(cell: Cell) -> CheckedPlan:
+    view = look(cell)
+    action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True))
+    plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
+    return check_plan(plan, cell.config)
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, device: object, method: str, call: int) -> None:
+    """Raise KeyboardInterrupt in the n-th call of a method."""
+    original, count = getattr(device, method), 0
+
+    def interrupted(*arguments: object) -> object:
+        nonlocal count
+        count += 1
+        if count == call:
+            raise KeyboardInterrupt
+        return original(*arguments)
+
+    monkeypatch.setattr(device, method, interrupted)
+
+
+def test_an_interrupt_in_motion_leaves_a_standing_arm_and_a_latch(
+    config: CellConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_cell(config) as cell:
+        executor, checked = Executor(cell), grasp_plan(cell)
+        interrupt(monkeypatch, cell.arm, "kick", call=60)
+        with pytest.raises(KeyboardInterrupt):
+            executor.run(checked)
+        assert not cell.arm.moving
+        cell.clock.sleep(0.05)
+        np.testing.assert_allclose(cell.arm.state().qd, 0, atol=0.02)
+        # The latch is the cell's: neither another executor nor the next job gets round it.
+        with pytest.raises(GuardTripped, match="recover"):
+            Executor(cell).run(checked)
+        with Journal(config.journal.database_url()) as journal, pytest.raises(GuardTripped, match="recover"):
+            run_job(cell, Scripted([grasp_at(*RED)]), journal, ("red",))
+        executor.recover()
+        assert cell.latch.violation is None
+
+
+def test_an_interrupt_while_the_fingers_close_stops_them(config: CellConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_cell(config) as cell:
+        cell.gripper.start_width(0.11, 40.0)
+        cell.clock.sleep(1.5)
+        checked = grasp_plan(cell)
+        interrupt(monkeypatch, cell.gripper, "state", call=8)
+        with pytest.raises(KeyboardInterrupt):
+            Executor(cell).run(checked)
+        width = cell.gripper.state().width_m
+        cell.clock.sleep(0.5)
+        assert cell.gripper.state().width_m == pytest.approx(width, abs=1e-3)
+        assert width > 0.082
+
+
+def test_a_gripper_that_hangs_latches(config: CellConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_cell(config) as cell:
+        checked = grasp_plan(cell)
+        hung = replace(cell.gripper.state(), busy=True)
+        monkeypatch.setattr(cell.gripper, "state", lambda: hung)
+        with pytest.raises(DeviceFault, match="still busy"):
+            Executor(cell).run(checked)
+        assert cell.latch.violation is not None
+        with pytest.raises(GuardTripped):
+            Executor(cell).run(checked)
+
+
+def test_a_paused_motion_is_given_up(config: CellConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open_cell(config) as cell:
+        checked = grasp_plan(cell)
+        # A speed slider at zero: the controller says that it moves, and nothing does.
+        monkeypatch.setattr(cell.arm, "start_joints", lambda *_: None)
+        monkeypatch.setattr(type(cell.arm), "moving", property(lambda _: True))
+        with pytest.raises(GuardTripped, match="stood still"):
+            Executor(cell).run(checked)
+
+
+def test_an_arm_in_the_view_is_not_taken_for_objects(config: CellConfig) -> None:
+    with open_cell(config) as cell:
+        q = np.array(config.motion.home_q) + np.array([0.7, 0, 0, 0, 0, 0])
+        cell.arm.start_joints(q, 1.0, 1.0)
+        while cell.arm.moving:
+            cell.clock.sleep(0.1)
+        with pytest.raises(DeviceFault, match="between the camera and the workspace"):
+            look(cell)
+
+
+def test_an_object_is_missed_even_when_another_fell_into_its_place(config: CellConfig) -> None:
+    with open_cell(config) as cell:
+        view = look(cell)
+        action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True))
+        # The blue cube now stands where the red one stood.
+        shift = round((RED[1] - BLUE[1]) / config.workspace.resolution_m)
+        after = replace(
+            view,
+            heightmap=replace(view.heightmap, height_m=np.roll(view.heightmap.height_m, shift, axis=0)),
+            segmentation=replace(
+                view.segmentation,
+                labels=np.where(
+                    np.roll(view.segmentation.labels, shift, axis=0) == find_goal(view.segmentation, "blue").label,
+                    find_goal(view.segmentation, "blue").label,
+                    0,
+                ).astype(np.int32),
+            ),
+        )
+        outcome = judge(Decision(1, "red", view, action), after, Execution(Ending.DONE, "home", 0.0, 0.05))
+    assert outcome.result is Result.PICKED
+
+
+def test_a_held_object_that_the_camera_does_not_miss_is_unconfirmed(config: CellConfig) -> None:
+    with open_cell(config) as cell:
+        view = look(cell)
+        action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True))
+        execution = Execution(Ending.DONE, "home", 0.0, 0.05)
+        outcome = judge(Decision(1, "red", view, action), look(cell), execution)
+    assert outcome.result is Result.UNCONFIRMED

@@ -1,0 +1,109 @@
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_twin.wire.rg2.modbus import Refusal, RefusedError, answer, split_frames
+
+PDUS = st.binary(min_size=1, max_size=253)
+# Mostly function codes that exist, with plausible numbers.
+REQUESTS = st.one_of(
+    PDUS,
+    st.builds(
+        lambda function, body: bytes([function]) + body,
+        st.sampled_from([3, 6, 16, 23]),
+        st.lists(st.integers(0, 300), max_size=9).map(lambda v: struct.pack(f">{len(v)}H", *v)),
+    ),
+)
+
+
+class Ten:
+    """Unit 65 with registers 0 to 9, of which 0 to 4 can be written with values below 100."""
+
+    def __init__(self):
+        self.registers = list(range(10))
+
+    def answers(self, unit):
+        return unit == 65
+
+    def read(self, unit, address, count):
+        if address + count > 10:
+            raise RefusedError(Refusal.ADDRESS)
+        return self.registers[address : address + count]
+
+    def write(self, unit, address, values):
+        if address + len(values) > 5:
+            raise RefusedError(Refusal.ADDRESS)
+        if any(value >= 100 for value in values):
+            raise RefusedError(Refusal.VALUE)
+        self.registers[address : address + len(values)] = values
+
+
+def frame(pdu, transaction=7, unit=65):
+    return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
+
+
+@given(st.lists(PDUS, min_size=1, max_size=5), st.data())
+def test_frames_are_whole_however_the_bytes_arrive(pdus, data):
+    stream = b"".join(frame(pdu) for pdu in pdus)
+    received, found, begin = bytearray(), [], 0
+    while begin < len(stream):
+        end = data.draw(st.integers(begin + 1, len(stream)))
+        received += stream[begin:end]
+        found += split_frames(received)
+        begin = end
+    assert found == [frame(pdu) for pdu in pdus]
+    assert not received
+
+
+@pytest.mark.parametrize(
+    "data", [b"\x00\x01\x00\x07\x00\x06A", b"\x00\x01\x00\x00\x00\x01A", b"\x00\x01\x00\x00\xff\xffA"]
+)
+def test_what_is_no_modbus_is_told_from_what_is_not_whole(data):
+    with pytest.raises(ValueError, match="not a Modbus"):
+        split_frames(bytearray(data))
+
+
+@given(REQUESTS, st.integers(0, 0xFFFF))
+def test_any_request_gets_its_answer_or_an_exception_code(pdu, transaction):
+    response = answer(frame(pdu, transaction), Ten())
+    number, protocol, length, unit = struct.unpack_from(">HHHB", response)
+    assert (number, protocol, unit) == (transaction, 0, 65)
+    assert length == len(response) - 6
+    assert response[7] in (pdu[0], pdu[0] | 0x80)
+    if response[7] & 0x80 and pdu[0] < 0x80:
+        assert len(response) == 9
+        assert response[8] in set(Refusal)
+
+
+@pytest.mark.parametrize(
+    ("pdu", "response"),
+    [
+        (struct.pack(">BHH", 3, 8, 2), struct.pack(">BBHH", 3, 4, 8, 9)),
+        (struct.pack(">BHH", 3, 9, 2), bytes([0x83, 2])),
+        (struct.pack(">BHH", 3, 0, 0), bytes([0x83, 3])),
+        (struct.pack(">BHH", 3, 0, 126), bytes([0x83, 3])),
+        (struct.pack(">BHH", 6, 1, 42), struct.pack(">BHH", 6, 1, 42)),
+        (struct.pack(">BHH", 6, 1, 142), bytes([0x86, 3])),
+        (struct.pack(">BHH", 6, 7, 42), bytes([0x86, 2])),
+        (struct.pack(">BHHBHH", 16, 1, 2, 4, 50, 51), struct.pack(">BHH", 16, 1, 2)),
+        (struct.pack(">BHHBHH", 16, 1, 3, 4, 50, 51), bytes([0x90, 3])),
+        (struct.pack(">BHHBHH", 16, 1, 2, 6, 50, 51), bytes([0x90, 3])),
+        (struct.pack(">BHHHHBH", 23, 0, 2, 1, 1, 2, 77), struct.pack(">BBHH", 23, 4, 0, 77)),
+        (struct.pack(">BHH", 4, 0, 1), bytes([0x84, 1])),
+        (bytes([43, 14, 1, 0]), bytes([0xAB, 1])),
+    ],
+)
+def test_answers_as_the_standard_says(pdu, response):
+    assert answer(frame(pdu), Ten())[7:] == response
+
+
+def test_a_write_and_read_that_cannot_read_does_not_write():
+    units = Ten()
+    assert answer(frame(struct.pack(">BHHHHBH", 23, 9, 2, 1, 1, 2, 77)), units)[7:] == bytes([0x97, 2])
+    assert units.registers == list(range(10))
+
+
+def test_an_unknown_unit_meets_silence():
+    assert answer(frame(struct.pack(">BHH", 3, 0, 1), unit=66), Ten()) is None
