@@ -166,8 +166,9 @@ class DepthCorrection(_Record):
 
 
 class FixedTag(_Record):
-    """A tag of the AprilTag family 36h11 that is fixed to the cell, as a fixed camera sees it
-    (`robotcell.perception.tags`).
+    """A tag of the AprilTag family 36h11 that is fixed to the cell, as a fixed camera sees it.
+
+    `robotcell.perception.tags` finds it.
 
     Attributes:
         id: of the tag.

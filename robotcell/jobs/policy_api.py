@@ -2,53 +2,43 @@
 
 from __future__ import annotations
 
-import enum
-import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from robotcell.errors import NoTarget
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import Push
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from robotcell.config.schema import Workspace
     from robotcell.perception.heightmap import Heightmap
 
-# Index k is a rotation of k * 22.5 degrees about base z (paper: "16 rotations").
-ROTATIONS = 16
-
-
-class Primitive(str, enum.Enum):
-    """The two motion primitives."""
-
-    GRASP = "grasp"
-    PUSH = "push"
+Action: TypeAlias = Grasp | Push
 
 
 @dataclass(frozen=True)
-class Action:
-    """A decision (x, y, z, theta, phi) of the paper.
+class PickAny:
+    """Pick any object."""
 
-    Attributes:
-        primitive: phi.
-        row, col: the cell of the heightmap that was chosen.
-        rotation: k of theta = k * 22.5 degrees; a grasp closes along (cos theta, sin theta), a push moves along it.
-        xyz: the surface at that cell, base frame [m].
-        q_value: what the policy expects of it; comparable only within one policy.
-    """
 
-    primitive: Primitive
-    row: int
-    col: int
-    rotation: int
-    xyz: tuple[float, float, float]
-    q_value: float
+@dataclass(frozen=True)
+class PickGoal:
+    """Pick one object; `mask` (H, W) are the cells that show it."""
 
-    @property
-    def theta(self) -> float:
-        """The rotation about base z [rad]."""
-        return 2 * math.pi * self.rotation / ROTATIONS
+    mask: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Uncover:
+    """Push aside what hides a goal; `mask` (H, W) are the cells of objects that may lie on it. Grasps are no answer."""
+
+    mask: npt.NDArray[np.bool_]
+
+
+Task: TypeAlias = PickAny | PickGoal | Uncover
 
 
 @dataclass(frozen=True)
@@ -56,21 +46,18 @@ class Observation:
     """What a policy decides on.
 
     Attributes:
-        heightmap: the table as the last frame showed it.
+        heightmap: the table as the last frame showed it, on the map of the policy (`Policy.workspace`).
         labels: (H, W) int32, cells that hold an object carry its number from 1, all others 0.
-        goal: (H, W) bool, cells of the goal object, or None when any object will do. Where the goal is hidden, the
-            cells of what may lie on it.
+        task: what is to be done.
         barred: actions that failed on the scene as it stands; the policy is not to repeat them.
         may_push: whether a push is allowed now.
-        may_grasp: whether a grasp is; what lies on a goal is pushed aside and not picked.
     """
 
     heightmap: Heightmap
     labels: npt.NDArray[np.int32]
-    goal: npt.NDArray[np.bool_] | None
-    barred: tuple[Action, ...]
-    may_push: bool
-    may_grasp: bool = True
+    task: Task
+    barred: tuple[Action, ...] = ()
+    may_push: bool = True
 
     @property
     def objects(self) -> npt.NDArray[np.bool_]:
@@ -78,14 +65,14 @@ class Observation:
         return self.labels > 0
 
     def targets(self) -> npt.NDArray[np.bool_]:
-        """(H, W) cells that an action may aim at: those of the goal, or of every object where there is no goal.
+        """(H, W) cells that an action may aim at: those of the task's mask, or of every object.
 
         Raises:
             NoTarget: none of them is seen.
         """
-        targets = self.objects if self.goal is None else self.goal
+        targets = self.objects if isinstance(self.task, PickAny) else self.task.mask
         if not targets.any():
-            what = "no object" if self.goal is None else "no cell of the goal"
+            what = "no object" if isinstance(self.task, PickAny) else "no cell of the goal"
             raise NoTarget(f"{what} is seen on the table; put one there, or end the job")
         return targets
 
@@ -96,6 +83,11 @@ class Policy(Protocol):
     @property
     def name(self) -> str:
         """As the command line and the journal call it."""
+        ...
+
+    @property
+    def workspace(self) -> Workspace:
+        """The map that it decides on: rectangle and resolution. The job builds this map for it."""
         ...
 
     def decide(self, observation: Observation) -> Action:
