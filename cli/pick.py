@@ -26,15 +26,15 @@ from robotcell.motion.grasp import Grasp
 from robotcell.perception.goals import goal_color
 
 if TYPE_CHECKING:
-    from robotcell.jobs.verdict import Outcome
-    from robotcell.jobs.decision import Decision
-    from robotcell.perception.view import View
     from pathlib import Path
 
     from rich.console import Console
     from rich.status import Status
 
+    from robotcell.jobs.decision import Decision
+    from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
+    from robotcell.perception.view import View
 
 
 def run_pick(

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from robotcell.cell import Cell
-from robotcell.config.calibration_file import CameraCalibration
 from robotcell.config import CameraMount, load_config
+from robotcell.config.calibration_file import CameraCalibration
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options
