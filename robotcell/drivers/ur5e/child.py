@@ -29,6 +29,7 @@ from robotcell.drivers.ur5e.link import (
     StartJoints,
     StartLinear,
 )
+from robotcell.interfaces import KICK_TIMEOUT_S
 from robotcell.io.shared_record import SharedRecord
 
 if TYPE_CHECKING:
@@ -55,8 +56,6 @@ _VARIABLES = [
 _MOVING_WATCHDOG_HZ = 8.0
 _IDLE_WATCHDOG_HZ = 1.0
 _KICK_PERIOD_S = 0.02
-# A motion is stopped when the driver has not kicked for this long.
-_SUPERVISION_S = 0.2
 # How long ur_rtde may hold this process: while it connects and uploads its program, and afterwards.
 _SETUP_LASTS_S = 7.5
 _HANG_S = 2.0
@@ -256,7 +255,7 @@ class _Session:
             if self._stop():
                 self._stops = int(supervision["stops"])
                 self._state.write(stops=self._stops)
-        elif self._moving and not self._stop_sent and now - float(supervision["kicked"]) > _SUPERVISION_S:
+        elif self._moving and not self._stop_sent and now - float(supervision["kicked"]) > KICK_TIMEOUT_S:
             self._stop()
         if self._interrupted:
             return
