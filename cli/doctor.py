@@ -13,7 +13,8 @@ from rich.text import Text
 from cli.console import progress, report_error, results
 from robotcell.cell import open_cell
 from robotcell.config.schema import load_config
-from robotcell.drivers.doctor.examine import Finding, Grade, examine
+from robotcell.drivers.doctor.examine import examine
+from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import CellError
 
 if TYPE_CHECKING:

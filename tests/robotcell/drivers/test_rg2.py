@@ -2,8 +2,10 @@
 
 import re
 import socket
+import struct
 import threading
 import time
+from contextlib import contextmanager
 from multiprocessing import resource_tracker
 
 import numpy as np
@@ -79,6 +81,7 @@ def fails_soon(call, error, words):
         except error as failure:
             assert time.monotonic() - began < BOUND_S
             assert re.search(words, str(failure)), failure
+            assert failure.device == "gripper"
             return
         time.sleep(0.01)
     pytest.fail("nothing failed")
@@ -162,8 +165,9 @@ def test_widths_are_between_the_tips_whatever_is_mounted(served, options, offset
         widest = min(0.11, 0.11 - 2 * offset)
         assert go(gripper, widest).width_m == pytest.approx(widest, abs=5e-4)
         for width in (widest + 0.001, max(0.0, -2 * offset) - 0.001):
-            with pytest.raises(UnsafeMotion, match="outside"):
+            with pytest.raises(UnsafeMotion, match="outside") as refusal:
                 gripper.start_width(width, 20.0)
+            assert refusal.value.device == "gripper"
     with RG2(options, WallClock()) as gripper:
         assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
 
@@ -287,9 +291,8 @@ def test_recover_leaves_a_gripper_that_is_free_as_it_is(served, gripper):
     assert not gripper.state().busy
 
 
-def test_recover_cannot_cure_a_switch_that_is_still_pushed(served, options, monkeypatch):
-    monkeypatch.setattr("robotcell.drivers.rg2._POWER_CYCLE_S", 2.0)
-    gripper = RG2(options, WallClock())
+def test_recover_cannot_cure_a_switch_that_is_still_pushed(served, options):
+    gripper = RG2(options.model_copy(update={"power_cycle_timeout_s": 2.0}), WallClock())
     inject(served, "state", Kind.WRONG, "s1")
     fails_soon(lambda: try_out(gripper), DeviceFault, "still pushed")
     with pytest.raises(DeviceFault, match="still pushed"):
@@ -334,19 +337,39 @@ def test_fingers_that_do_not_arrive_and_hold_nothing_are_a_fault(served, gripper
     assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
 
 
-def test_a_grip_bit_at_the_commanded_width_is_no_grip(served, gripper):
-    go(gripper, 0.05)
+def test_a_grip_bit_at_the_commanded_width_is_no_grip(served, options):
     inject(served, "state", Kind.WRONG, "grip")
-    soon(lambda: gripper._registers().status & 2)
-    assert not gripper.state().grip_detected
-    served.clear()
-    go(gripper, 0.08)
+    client = raw(options)
+    soon(lambda: client.read_holding_registers(268, count=1, device_id=65).registers[0] & 2)
+    client.close()
+    with RG2(options, WallClock()) as gripper:
+        assert not go(gripper, 0.05).grip_detected
+        served.clear()
+        go(gripper, 0.08)
 
 
-def test_another_device_is_not_driven(options, monkeypatch):
-    monkeypatch.setattr("robotcell.drivers.rg2._PRODUCTS", {0x20: "RG6"})
-    with pytest.raises(DeviceFault, match="is RG6, not an RG2"):
-        RG2(options, WallClock()).connect()
+@contextmanager
+def box_with(product):
+    """A Compute Box that tells the code of the device behind it, and nothing else; where it listens."""
+    with socket.create_server(("127.0.0.28", 0)) as server:
+
+        def serve():
+            connection, _ = server.accept()
+            with connection:
+                transaction = connection.recv(64)[:2]
+                connection.sendall(transaction + struct.pack(">HHBBBH", 0, 5, 65, 3, 2, product))
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield server.getsockname()
+        thread.join()
+
+
+@pytest.mark.parametrize(("product", "words"), [(0x21, "is RG6, not an RG2"), (0x99, r"an unknown device \(0x99\)")])
+def test_another_device_is_not_driven(product, words):
+    with box_with(product) as (host, port), pytest.raises(DeviceFault, match=words) as refusal:
+        RG2(RG2Options(host=host, port=port), WallClock()).connect()
+    assert refusal.value.device == "gripper"
 
 
 def test_close_stops_the_fingers_and_frees_the_box(served, options):

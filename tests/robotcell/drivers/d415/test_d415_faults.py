@@ -11,7 +11,6 @@ from robotcell.cell import Cell
 from robotcell.config.calibration_file import CameraCalibration
 from robotcell.config.schema import CameraMount, load_config
 from robotcell.drivers.clock import WallClock
-from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
 from robotcell.jobs.job import look
@@ -65,19 +64,15 @@ def served():
 
 
 @pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """The exposure of this camera has nothing to settle."""
-    monkeypatch.setattr(d415, "_WARM_UP_FRAMES", 3)
-
-
-@pytest.fixture(autouse=True)
 def lift(served):
     yield
     served.inject()
 
 
-def driver(served, serial=SERIAL, **mount):
-    return D415(D415Options(source=served.source, serial=serial), CameraMount(**mount), WallClock())
+def driver(served, serial=SERIAL, warm_up_frames=3, **mount):
+    """The exposure of this camera, unless it is noisy, has nothing to settle."""
+    options = D415Options(source=served.source, serial=serial, warm_up_frames=warm_up_frames)
+    return D415(options, CameraMount(**mount), WallClock())
 
 
 def connect(camera):
@@ -191,13 +186,14 @@ def test_the_calibration_must_be_of_this_camera(served, tmp_path):
     with driver(served, calibration=calibration(tmp_path)) as camera:
         camera.read()
     for change, words in (({"serial": "424242"}, f"424242, and {SERIAL}"), ({"width": 1280}, "1280x480, and 640x480")):
-        with pytest.raises(CalibrationError, match=words):
+        with pytest.raises(CalibrationError, match=words) as refusal:
             driver(served, calibration=calibration(tmp_path, **change)).connect()
+        assert refusal.value.device == "camera"
 
 
-def test_a_frame_shows_what_the_camera_sees_with_settled_exposure(monkeypatch):
-    monkeypatch.undo()
-    with ServedCamera("127.0.0.38") as noisy, driver(noisy, serial=None) as camera:
+def test_a_frame_shows_what_the_camera_sees_with_settled_exposure():
+    settled = D415Options().warm_up_frames
+    with ServedCamera("127.0.0.38") as noisy, driver(noisy, serial=None, warm_up_frames=settled) as camera:
         first = camera.read()
         later = [camera.read() for _ in range(5)][-1]
     assert first.color.mean() == pytest.approx(later.color.mean(), rel=0.02)

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from cli.main import app
 from robotcell.config.schema import load_config
-from robotcell.drivers.doctor.examine import Finding, Grade, examine
+from robotcell.drivers.doctor.examine import examine
+from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
