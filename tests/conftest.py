@@ -26,6 +26,26 @@ settings.load_profile("repeatable")
 _CLIENT_IDS = range(64)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of the contract suite on a real cell."""
+    group = parser.getgroup("robotcell", "a real cell")
+    group.addoption("--cell-file", help="cell.toml of the real cell on which `-m hardware` states the contract")
+    group.addoption(
+        "--i-stand-at-the-emergency-stop",
+        action="store_true",
+        help="needed with --cell-file: the arm moves up to 0.35 rad from home, and the fingers open and close",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Nothing moves a real arm by accident."""
+    if config.getoption("cell_file") is not None and not config.getoption("i_stand_at_the_emergency_stop"):
+        raise pytest.UsageError(
+            "the cell of --cell-file will move: clear the table and the space around the arm, take the arm near home, "
+            "stand at the emergency stop, and say so by --i-stand-at-the-emergency-stop"
+        )
+
+
 def _left_behind() -> dict[str, set[object]]:
     process = psutil.Process()
     pybullet = sys.modules.get("pybullet")
