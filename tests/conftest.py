@@ -46,12 +46,27 @@ def pytest_configure(config: pytest.Config) -> None:
         )
 
 
+def _children(process: psutil.Process) -> set[int]:
+    """All processes below one. Linux lists the children of a thread; psutil looks at every process of the machine."""
+    children: set[int] = set()
+    pending = [process.pid]
+    try:
+        while pending:
+            for task in Path(f"/proc/{pending.pop()}/task").iterdir():
+                found = {int(pid) for pid in (task / "children").read_text().split()}
+                children |= found
+                pending.extend(found)
+    except OSError:  # not Linux, or something ended meanwhile
+        return {child.pid for child in process.children(recursive=True)}
+    return children
+
+
 def _left_behind() -> dict[str, set[object]]:
     process = psutil.Process()
     pybullet = sys.modules.get("pybullet")
     return {
         "threads": set(threading.enumerate()),
-        "processes": {child.pid for child in process.children(recursive=True)},
+        "processes": _children(process),
         "sockets": {connection.laddr for connection in process.net_connections()},
         "pybullet clients": {i for i in _CLIENT_IDS if pybullet.isConnected(i)} if pybullet else set(),
         "files in the working folder": {path.name for path in Path.cwd().iterdir() if not path.name.startswith(".")},

@@ -6,50 +6,27 @@ import struct
 import threading
 import time
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 from pymodbus.client import ModbusTcpClient
 
-from robotcell.config.schema import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
-from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.faults import Fault, Kind
+from tests.robotcell.drivers.served_cell import HOST, MODBUS_PORT
 from tests.sim_twin.cells import joints_at, tool_down
 
-HOST = "127.0.0.26"
 # Twice what a lost, silent or garbling device may hold the program for: computers that run tests are busy.
 BOUND_S = 2.0
 LIMIT_S = 20.0
 
 
-SCENE = """
-name = "one cube"
-[[object]]
-name = "cube"
-shape = "cube"
-color = "red"
-position = [0.0, 0.0, 0.025]
-"""
-
-
-@pytest.fixture(scope="module")
-def served(tmp_path_factory):
-    resource_tracker.ensure_running()
-    scene = tmp_path_factory.mktemp("scenes") / "cube.toml"
-    scene.write_text(SCENE, encoding="utf-8")
-    config = load_config(None, {"backend.options.scene": str(scene)})
-    with ServedCell(config, HOST, modbus_port=0, camera_port=0) as cell:
-        yield cell
-
-
 @pytest.fixture
 def options(served):
-    yield RG2Options(host=HOST, port=int(served.endpoints["modbus"].rpartition(":")[2]), timeout_s=0.3)
+    yield RG2Options(host=HOST, port=MODBUS_PORT, timeout_s=0.3)
     served.clear()
 
 
