@@ -43,7 +43,7 @@ PERIOD_S = 0.008
 OPEN_M = 0.08
 # No test of the contract takes a joint further from home than this. A real arm that stands elsewhere is not moved.
 NEAR_HOME_RAD = 0.35
-# By how much slower a real arm moves than a simulated one: joint 1 at 0.125 rad/s instead of 0.5 rad/s.
+# How fast a real arm moves, as a share of a simulated one: no joint exceeds 0.3 rad/s.
 REAL_PACE = 0.25
 
 
