@@ -71,8 +71,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("opened", cells, indirect=True, scope="package")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of the tests in this folder, those that share a connected cell come last."""
+    """Of the tests in this folder, those that share a connected cell come last. Pytest then groups them by cell."""
     places = [i for i, item in enumerate(items) if Path(__file__).parent in item.path.parents]
     ours = sorted((items[i] for i in places), key=lambda item: "connected_cell" in getattr(item, "fixturenames", ()))
     for i, item in zip(places, ours, strict=True):

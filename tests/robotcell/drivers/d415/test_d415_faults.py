@@ -69,9 +69,9 @@ def lift(served):
     served.inject()
 
 
-def driver(served, serial=SERIAL, warm_up_frames=3, **mount):
-    """The exposure of this camera, unless it is noisy, has nothing to settle."""
-    options = D415Options(source=served.source, serial=serial, warm_up_frames=warm_up_frames)
+def driver(served, serial=SERIAL, **mount):
+    """The exposure of this camera has nothing to settle."""
+    options = D415Options(source=served.source, serial=serial, warm_up_frames=3)
     return D415(options, CameraMount(**mount), WallClock())
 
 
@@ -159,7 +159,7 @@ def test_what_can_be_lived_with_is(served, fault):
     assert (np.diff([view.frame.number for view in views]) > 0).all()
 
 
-def test_a_server_that_dies_is_lost_and_its_successor_is_found(served):
+def test_a_server_that_dies_is_lost_and_its_successor_is_found():
     with ServedCamera("127.0.0.37", overrides=WITHOUT_NOISE) as mortal, driver(mortal) as camera:
         camera.read()
         mortal.process.kill()
@@ -189,14 +189,3 @@ def test_the_calibration_must_be_of_this_camera(served, tmp_path):
         with pytest.raises(CalibrationError, match=words) as refusal:
             driver(served, calibration=calibration(tmp_path, **change)).connect()
         assert refusal.value.device == "camera"
-
-
-def test_a_frame_shows_what_the_camera_sees_with_settled_exposure():
-    settled = D415Options().warm_up_frames
-    with ServedCamera("127.0.0.38") as noisy, driver(noisy, serial=None, warm_up_frames=settled) as camera:
-        first = camera.read()
-        later = [camera.read() for _ in range(5)][-1]
-    assert first.color.mean() == pytest.approx(later.color.mean(), rel=0.02)
-    assert first.serial == SERIAL
-    T = noisy.config.camera.pose()
-    assert np.median(first.depth_m[220:260, 300:340]) == pytest.approx(-T[2, 3] / T[2, 2], abs=0.06)
