@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import sys
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from robotcell.config.schema import load_config
@@ -36,17 +34,3 @@ def serve(
     config = load_config(None, {"backend.name": "twin", "backend.options.scene": str(scene)})
     with ServedCell(config, host, modbus_port, camera_port) as served:
         yield served
-
-
-@contextmanager
-def supervising() -> Iterator[None]:
-    """On a busy machine a test must not miss its periods: go ahead of everything else, where the system allows it."""
-    if sys.platform != "linux":
-        yield
-        return
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))

@@ -142,8 +142,9 @@ def test_the_arm_stands_when_the_child_dies(served: ServedCell, arm: UR5e, numbe
     assert child is not None
     assert stands_after(served, lambda: os.kill(child, number)) < STANDS_S
     assert is_lost(arm) < LOST_S
-    with pytest.raises(ConnectionLost, match="connect it again"):
+    with pytest.raises(ConnectionLost, match="connect it again") as lost:
         arm.moving  # noqa: B018
+    assert lost.value.device == "arm"
     assert not psutil.pid_exists(child)
     works(arm)
 
