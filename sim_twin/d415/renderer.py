@@ -16,7 +16,7 @@ from sim_twin.d415.rays import Hits, RayCaster, ray_directions
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.geometry.transforms import Array
     from sim_twin.d415.noise import NoiseOptions
     from sim_twin.world.world import Visual

@@ -9,10 +9,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from robotcell.cell import Cell
 from robotcell.geometry.transforms import make_transform, rotvec_to_matrix
+from robotcell.interfaces import Devices
 from sim_twin.d415.noise import NoiseOptions
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CameraMount, CellConfig
+    from robotcell.config import CameraMount, CellConfig
     from robotcell.geometry.transforms import Array
     from sim_twin.world.world import World
 
@@ -56,9 +57,9 @@ class TwinBackend:
     Options: type[BaseModel] = TwinOptions
 
     @staticmethod
-    def open(config: CellConfig) -> Cell:
-        """The twin of a configuration, not yet connected."""
-        return open_twin(config)[0]
+    def open(config: CellConfig) -> Devices:
+        """The twin's devices, not yet connected."""
+        return open_twin(config)[0].devices
 
 
 def open_twin(config: CellConfig) -> tuple[Cell, World]:
@@ -72,4 +73,5 @@ def open_twin(config: CellConfig) -> tuple[Cell, World]:
     options = TwinOptions.model_validate(config.backend.options)
     world = World(config, options)
     camera = TwinCamera(world, config.camera, options.noise, options.seed, options.camera_pose(config.camera))
-    return Cell(config, TwinArm(world), TwinGripper(world), camera, TwinClock(world)), world
+    devices = Devices(TwinArm(world), TwinGripper(world), camera, TwinClock(world))
+    return Cell(config, devices), world

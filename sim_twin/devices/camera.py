@@ -14,7 +14,7 @@ from sim_twin.wire.d415.stream import SERIAL
 from sim_twin.world.world import STEP_S
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.geometry.transforms import Array
     from sim_twin.world.world import World
 

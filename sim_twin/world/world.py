@@ -26,7 +26,7 @@ from sim_twin.world.furniture import furniture
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.devices.backend import TwinOptions
     from sim_twin.scenes.catalog import Scene, SceneObject
     from sim_twin.scenes.shapes import Mesh, Shape

@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.interfaces import ArmMode
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from robotcell.cell import Cell
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.wire.cell import ServedCell
 
 TWIN = {"backend.name": "twin", "backend.options.objects": 1}

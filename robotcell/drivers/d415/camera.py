@@ -25,7 +25,7 @@ from robotcell.errors import CellError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Camera, RgbdFrame
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.drivers.d415.source import CameraSource
     from robotcell.interfaces import Clock
 

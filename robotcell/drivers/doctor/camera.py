@@ -13,7 +13,7 @@ from robotcell.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.drivers.d415.camera import D415Options
 
 _MIN_FRAME_RATE = 25.0

@@ -19,7 +19,7 @@ from robotcell.errors import CellError, ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 
 def examine(config: CellConfig, seconds: float) -> list[Finding]:

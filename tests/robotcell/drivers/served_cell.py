@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from sim_twin.wire.cell import ServedCell
 
 if TYPE_CHECKING:

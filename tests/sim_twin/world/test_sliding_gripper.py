@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.geometry.transforms import make_transform
 from sim_twin.devices.backend import TwinOptions
 from sim_twin.scenes.scene import Scene, SceneObject

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from sim_twin.wire.d415.stream import SERIAL

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import examine
 from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.wire.cell import ServedCell
 
 SECONDS = 1.0
