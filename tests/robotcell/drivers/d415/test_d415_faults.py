@@ -13,7 +13,7 @@ from robotcell.config.calibration_file import CameraCalibration
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
-from robotcell.perception.view import look
+from robotcell.interfaces import Devices
 from sim_twin.wire.d415.server import FAULTS, WRONG_SERIAL
 from sim_twin.wire.d415.stream import SERIAL
 from sim_twin.wire.faults import Kind
@@ -102,7 +102,7 @@ def looking(camera):
     """A cell whose arm stands at home and whose camera this is."""
     config = load_config()
     arm = SimpleNamespace(state=lambda: SimpleNamespace(q=np.array(config.motion.home_q)))
-    return Cell(config, arm, SimpleNamespace(), camera, WallClock())
+    return Cell(config, Devices(arm, SimpleNamespace(), camera, WallClock()))
 
 
 def names(rows):
@@ -118,13 +118,13 @@ def test_a_fault_while_the_stream_runs_is_an_error_and_passes(served, row):
     *fault, error, words = row
     with driver(served) as camera:
         cell = looking(camera)
-        look(cell)
+        cell.look()
         served.inject(tuple(fault))
         with pytest.raises(error, match=words):
-            again_and_again(lambda: look(cell))
+            again_and_again(cell.look)
     served.inject()
     connect(camera)
-    look(cell)
+    cell.look()
     camera.close()
 
 
@@ -155,7 +155,7 @@ def test_what_can_be_lived_with_is(served, fault):
         served.inject(fault)
         time.sleep(0.2)
         cell = looking(camera)
-        views = [look(cell) for _ in range(3)]
+        views = [cell.look() for _ in range(3)]
     assert (np.diff([view.frame.number for view in views]) > 0).all()
 
 
