@@ -10,7 +10,8 @@ from rich.text import Text
 
 from cli.console import print_json, progress, report_error, results
 from robotcell.cell import open_cell
-from robotcell.drivers.doctor.examine import Finding, Grade, examine
+from robotcell.drivers.doctor.examine import examine
+from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import CellError
 
 if TYPE_CHECKING:

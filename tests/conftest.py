@@ -26,12 +26,47 @@ settings.load_profile("repeatable")
 _CLIENT_IDS = range(64)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of the contract suite on a real cell."""
+    group = parser.getgroup("robotcell", "a real cell")
+    group.addoption("--cell-file", help="cell.toml of the real cell on which `-m hardware` states the contract")
+    group.addoption(
+        "--i-stand-at-the-emergency-stop",
+        action="store_true",
+        help="needed with --cell-file: the arm moves up to 0.35 rad from home, and the fingers open and close",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Nothing moves a real arm by accident."""
+    if config.getoption("cell_file") is not None and not config.getoption("i_stand_at_the_emergency_stop"):
+        raise pytest.UsageError(
+            "the cell of --cell-file will move: clear the table and the space around the arm, take the arm near home, "
+            "stand at the emergency stop, and say so by --i-stand-at-the-emergency-stop"
+        )
+
+
+def _children(process: psutil.Process) -> set[int]:
+    """All processes below one. Linux lists the children of a thread; psutil looks at every process of the machine."""
+    children: set[int] = set()
+    pending = [process.pid]
+    try:
+        while pending:
+            for task in Path(f"/proc/{pending.pop()}/task").iterdir():
+                found = {int(pid) for pid in (task / "children").read_text().split()}
+                children |= found
+                pending.extend(found)
+    except OSError:  # not Linux, or something ended meanwhile
+        return {child.pid for child in process.children(recursive=True)}
+    return children
+
+
 def _left_behind() -> dict[str, set[object]]:
     process = psutil.Process()
     pybullet = sys.modules.get("pybullet")
     return {
         "threads": set(threading.enumerate()),
-        "processes": {child.pid for child in process.children(recursive=True)},
+        "processes": _children(process),
         "sockets": {connection.laddr for connection in process.net_connections()},
         "pybullet clients": {i for i in _CLIENT_IDS if pybullet.isConnected(i)} if pybullet else set(),
         "files in the working folder": {path.name for path in Path.cwd().iterdir() if not path.name.startswith(".")},

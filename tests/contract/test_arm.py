@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from robotcell.errors import ConnectionLost, UnsafeMotion
+from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import make_transform, rotation_angle, rotation_z
-from robotcell.interfaces import ArmMode
+from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.cell import Cell
     from robotcell.geometry.transforms import Array
+    from tests.contract.conftest import Opened
 
 PERIOD_S = 0.008
 
@@ -34,7 +37,7 @@ def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:
 @pytest.mark.parametrize("call", ["state", "stop", "kick", "recover", "moving", "start_joints", "start_linear"])
 def test_refuses_everything_before_it_is_connected(closed_cell: Cell, call: str) -> None:
     arm = closed_cell.arm
-    calls = {
+    calls: dict[str, Callable[[], object]] = {
         "state": arm.state,
         "stop": arm.stop,
         "kick": arm.kick,
@@ -58,34 +61,35 @@ def test_state_is_one_consistent_measurement(cell: Cell) -> None:
     np.testing.assert_allclose(state.q, cell.config.motion.home_q, atol=0.01)
 
 
-def test_joint_motion_returns_at_once_and_arrives(cell: Cell) -> None:
+def test_joint_motion_returns_at_once_and_arrives(cell: Cell, pace: float) -> None:
     target = cell.arm.state().q + np.array((0.2, -0.1, 0.1, 0.0, 0.1, -0.3))
     begin = cell.clock.now()
-    cell.arm.start_joints(target, 1.0, 1.4)
+    cell.arm.start_joints(target, 1.0 * pace, 1.4 * pace**2)
     assert cell.arm.moving
     finish(cell)
     # 0.3 rad with ramps of 1.4 rad/s^2 never reach 1 rad/s: 2 sqrt(0.3 / 1.4) s.
     # In real time a busy machine may hold the motion up, and never hurries it.
-    assert 2 * np.sqrt(0.3 / 1.4) - 0.1 < cell.clock.now() - begin < 2 * np.sqrt(0.3 / 1.4) + 1.0
+    lasts_s = 2 * np.sqrt(0.3 / 1.4) / pace
+    assert lasts_s - 0.1 < cell.clock.now() - begin < lasts_s + 1.0
     np.testing.assert_allclose(cell.arm.state().q, target, atol=2e-3)
     np.testing.assert_allclose(cell.arm.state().qd, 0, atol=0.02)
 
 
-def test_joint_motion_to_where_it_is_ends_at_once(cell: Cell) -> None:
+def test_joint_motion_to_where_it_is_ends_at_once(cell: Cell, pace: float) -> None:
     q = cell.arm.state().q
-    cell.arm.start_joints(q, 1.0, 1.4)
+    cell.arm.start_joints(q, 1.0 * pace, 1.4 * pace**2)
     finish(cell)
     np.testing.assert_allclose(cell.arm.state().q, q, atol=1e-3)
 
 
-def test_linear_motion_keeps_to_the_line_and_its_speed(cell: Cell) -> None:
+def test_linear_motion_keeps_to_the_line_and_its_speed(cell: Cell, pace: float) -> None:
     T_start = cell.arm.state().T_base_tcp
     T_end = T_start.copy()
     T_end[:3, 3] += (0.05, -0.04, 0.06)
     T_end[:3, :3] = rotation_z(0.3) @ T_end[:3, :3]
     along = T_end[:3, 3] - T_start[:3, 3]
     length = np.linalg.norm(along)
-    cell.arm.start_linear(T_end, 0.1, 0.5)
+    cell.arm.start_linear(T_end, 0.1 * pace, 0.5 * pace**2)
     states = [cell.arm.state()]
     while cell.arm.moving:
         cell.arm.kick()
@@ -97,61 +101,79 @@ def test_linear_motion_keeps_to_the_line_and_its_speed(cell: Cell) -> None:
     steps = np.array([state.T_base_tcp[:3, 3] for state in states]) - T_start[:3, 3]
     times = np.array([state.t for state in states])
     assert np.linalg.norm(np.cross(steps, along / length), axis=1).max() < 0.001
-    # Over a fifth of a second: a device measures less often than it reports.
-    later = np.searchsorted(times, times + 0.2)
+    # Over some time: a device measures less often than it reports, and a served arm that was late catches up.
+    later = np.searchsorted(times, times + 0.4)
     whole = later < len(times)
     ways = np.linalg.norm(steps[later[whole]] - steps[whole], axis=1)
-    assert (ways / (times[later[whole]] - times[whole])).max() < 0.1 * 1.2
+    assert (ways / (times[later[whole]] - times[whole])).max() < 0.1 * pace * 1.3
     T_reached = cell.arm.state().T_base_tcp
     assert np.abs(T_reached[:3, 3] - T_end[:3, 3]).max() < 0.001
     assert rotation_angle(T_reached[:3, :3], T_end[:3, :3]) < 0.005
 
 
-def test_stop_ends_a_motion_short_of_its_target(cell: Cell) -> None:
+def test_stop_ends_a_motion_short_of_its_target(cell: Cell, pace: float) -> None:
     start = cell.arm.state().q
-    cell.arm.start_joints(start + np.array((0.5, 0, 0, 0, 0, 0)), 0.5, 1.4)
-    run(cell, 0.5)
+    cell.arm.start_joints(start + np.array((0.3, 0, 0, 0, 0, 0)), 0.5 * pace, 1.4 * pace**2)
+    run(cell, 0.5 / pace)
     cell.arm.stop()
     at_stop = cell.arm.state().q[0]
     finish(cell)
     run(cell, 0.2)
     state = cell.arm.state()
     assert state.mode is ArmMode.READY
-    assert start[0] + 0.05 < state.q[0] < start[0] + 0.4
+    assert start[0] + 0.05 < state.q[0] < start[0] + 0.27
     # 0.5 rad/s is braked within less than a tenth of a second.
     assert state.q[0] - at_stop < 0.05
     np.testing.assert_allclose(state.qd, 0, atol=0.02)
     cell.arm.stop()
 
 
-def test_a_second_motion_waits_for_the_first(cell: Cell) -> None:
+def test_a_second_motion_waits_for_the_first(cell: Cell, pace: float) -> None:
     q = cell.arm.state().q
-    cell.arm.start_joints(q + 0.05, 0.5, 1.0)
+    cell.arm.start_joints(q + 0.05, 0.5 * pace, pace**2)
     with pytest.raises(UnsafeMotion, match="moving"):
-        cell.arm.start_joints(q, 0.5, 1.0)
+        cell.arm.start_joints(q, 0.5 * pace, pace**2)
     finish(cell)
     np.testing.assert_allclose(cell.arm.state().q, q + 0.05, atol=2e-3)
 
 
-def test_the_watchdog_stops_an_arm_whose_supervisor_fell_silent(cell: Cell) -> None:
+def test_the_watchdog_stops_an_arm_whose_supervisor_fell_silent(cell: Cell, pace: float) -> None:
     q = cell.arm.state().q
-    cell.arm.start_joints(q + np.array((0.5, 0, 0, 0, 0, 0)), 0.5, 1.4)
+    cell.arm.start_joints(q + np.array((0.3, 0, 0, 0, 0, 0)), 0.5 * pace, 1.4 * pace**2)
     for _ in range(20):
         cell.arm.kick()
         cell.clock.sleep(PERIOD_S)
     assert cell.arm.moving
     cell.clock.sleep(0.5)
     assert not cell.arm.moving
-    assert cell.arm.state().q[0] < q[0] + 0.3
+    assert cell.arm.state().q[0] < q[0] + 0.25
+
+
+def test_a_motion_that_nobody_ever_kicks_stops(closed_cell: Cell, pace: float) -> None:
+    with closed_cell.arm as arm, closed_cell.gripper:
+        start = arm.state().q[0]
+        begin = closed_cell.clock.now()
+        arm.start_joints(arm.state().q + np.array((0.3, 0, 0, 0, 0, 0)), 0.5 * pace, 1.4 * pace**2)
+        while arm.moving and closed_cell.clock.now() - begin < 2.0:
+            closed_cell.clock.sleep(PERIOD_S)
+        # The motion takes 0.96 s. In real time a busy machine notices the silence, and the standstill, late.
+        assert KICK_TIMEOUT_S < closed_cell.clock.now() - begin < KICK_TIMEOUT_S + 0.5
+        assert not arm.moving
+        turned = arm.state().q[0] - start
+        assert turned < 0.2
+        assert arm.state().mode is ArmMode.READY
+        arm.start_joints(arm.state().q - np.array((turned, 0, 0, 0, 0, 0)), 0.5 * pace, 1.4 * pace**2)
+        finish(closed_cell)
+        assert arm.state().q[0] == pytest.approx(start, abs=2e-3)
 
 
 BAD_JOINTS = [np.zeros(5), np.full(6, np.nan), np.array([7.0, 0, 0, 0, 0, 0]), np.array([0, 0, 3.2, 0, 0, 0])]
 
 
 @pytest.mark.parametrize("q", BAD_JOINTS)
-def test_refuses_joint_targets_that_it_does_not_have(cell: Cell, q: Array) -> None:
+def test_refuses_joint_targets_that_it_does_not_have(cell: Cell, pace: float, q: Array) -> None:
     with pytest.raises(UnsafeMotion):
-        cell.arm.start_joints(q, 0.5, 1.0)
+        cell.arm.start_joints(q, 0.5 * pace, pace**2)
     assert not cell.arm.moving
 
 
@@ -166,15 +188,27 @@ def test_refuses_speeds_and_accelerations_outside_its_range(cell: Cell, value: f
     assert not cell.arm.moving
 
 
-def test_refuses_poses_that_are_none_or_out_of_reach(cell: Cell) -> None:
+def test_refuses_poses_that_are_none(cell: Cell, pace: float) -> None:
     T = cell.arm.state().T_base_tcp
-    far = T.copy()
-    far[:3, 3] = (-2.0, 0.0, 0.3)
     mirrored = T @ np.diag([1.0, 1.0, -1.0, 1.0])
-    for pose in (far, mirrored, T[:3], np.full((4, 4), np.nan)):
+    for pose in (mirrored, T[:3], np.full((4, 4), np.nan)):
         with pytest.raises(UnsafeMotion):
-            cell.arm.start_linear(pose, 0.1, 0.5)
+            cell.arm.start_linear(pose, 0.1 * pace, 0.5 * pace**2)
     assert not cell.arm.moving
+
+
+def test_a_line_out_of_reach_leaves_an_arm_that_must_be_recovered(cell: Cell, opened: Opened) -> None:
+    if opened.real:
+        pytest.skip("a real arm is not sent to the end of its reach")
+    far = cell.arm.state().T_base_tcp.copy()
+    far[:3, 3] = (-2.0, 0.0, 0.3)
+    cell.arm.start_linear(far, 0.5, 1.0)
+    finish(cell)
+    assert cell.arm.state().mode is not ArmMode.READY
+    with pytest.raises(DeviceFault):
+        cell.arm.start_linear(far, 0.5, 1.0)
+    cell.arm.recover()
+    assert cell.arm.state().mode is ArmMode.READY
 
 
 def test_recover_does_nothing_to_an_arm_that_is_ready(cell: Cell) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import suppress
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from robotcell.drivers.d415.frame_check import FRAMES_PER_S, FrameCheck, check_images
 from robotcell.drivers.d415.images import D415Images
 from robotcell.drivers.d415.realsense import (
     USB_ADVICE,
@@ -21,34 +19,21 @@ from robotcell.drivers.d415.realsense import (
     sdk_errors,
     serial_number,
 )
+from robotcell.drivers.d415.source import open_recording, open_source
 from robotcell.drivers.unconfirmed import warn_unconfirmed
-from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
+from robotcell.errors import CellError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Camera, RgbdFrame
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
     from robotcell.config import CameraMount
+    from robotcell.drivers.d415.source import CameraSource
     from robotcell.interfaces import Clock
 
-FRAMES_PER_S = 30
-
-# Frames in which automatic exposure settles.
-_WARM_UP_FRAMES = 30
-# A device takes up to a second from start to its first frame.
-_FIRST_FRAME_S = 2.0
 _FRAME_S = 1.0
 # A device that was reset disappears within this time, and is back within the second.
 _RESET_S = 3.0
 _RETURN_S = 10.0
 _POLL_S = 0.2
-# Exposure, read-out and transfer of a frame: by how much it is older than its arrival, where the camera does not say.
-_TRANSFER_S = 0.05
-# Depth and colour of one moment; more than a period apart they are of two.
-_SAME_MOMENT_S = 1 / FRAMES_PER_S
-# Of pixels with depth, and mean count of 255: an image below is of a covered or broken camera, or of no light at all.
-_MIN_DEPTH_SHARE = 0.01
-_MIN_BRIGHTNESS = 5.0
 
 
 class D415Options(BaseModel):
@@ -60,6 +45,8 @@ class D415Options(BaseModel):
         serial: of the camera; needed where several are connected.
         spatial_filter: librealsense's edge-preserving smoothing of depth.
         temporal_frames: how many frames a depth image is smoothed over, all taken after `read` was called.
+        warm_up_frames: frames in which automatic exposure settles, which are not used.
+        first_frame_timeout_s: within which a device must send its first frame; it takes up to a second.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -69,23 +56,8 @@ class D415Options(BaseModel):
     spatial_filter: bool = False
     # They are held until the last has come; librealsense has 16 for everybody.
     temporal_frames: Annotated[int, Field(ge=1, le=8)] = 1
-
-
-class CameraSource(Protocol):
-    """Cameras that are not on USB. An entry point of the group `robotcell.camera_sources` is a function that opens one.
-
-    It is called with the address and with the resolution that will be asked for, as "640x480", and raises
-    ConnectionLost if nothing is there.
-    """
-
-    @property
-    def context(self) -> Any:
-        """The pyrealsense2 context in which the cameras are found."""
-        ...
-
-    def close(self) -> None:
-        """End it. Called after the last stream has ended."""
-        ...
+    warm_up_frames: Annotated[int, Field(ge=1, le=300)] = 30
+    first_frame_timeout_s: Annotated[float, Field(ge=0.1, le=30.0)] = 2.0
 
 
 class D415(Camera):
@@ -110,9 +82,7 @@ class D415(Camera):
         self._serial: str | None = None
         # What is connected, in words; empty before.
         self.description = ""
-        self._last_number = -1
-        # Frames of earlier rounds of a recorded file.
-        self._earlier_numbers = 0
+        self._frame_check = FrameCheck(clock, recorded=self._recorded)
 
     def connect(self) -> None:
         """Start the streams and wait until exposure has settled. Tries three times, the last after a hardware reset.
@@ -129,8 +99,11 @@ class D415(Camera):
             warn_unconfirmed("D415")
         try:
             self._connect()
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if isinstance(error, CellError):
+                # A source of frames and a calibration file know of no device.
+                error.device = "camera"
             raise
 
     def close(self) -> None:
@@ -149,7 +122,7 @@ class D415(Camera):
                 different moments.
         """
         if self._images is None:
-            raise ConnectionLost("camera: it is not connected; call connect() first")
+            raise ConnectionLost("camera: it is not connected; call connect() first", device="camera")
         called = self._clock.now()
         with sdk_errors("emptying the queue of frames"):
             self._pipeline.poll_for_frames()
@@ -165,16 +138,16 @@ class D415(Camera):
                 problem = "" if left > _FRAME_S / 2 else problem
                 break
             try:
-                t, number = self._check(frameset, called)
+                t, number = self._frame_check.check(frameset, called)
                 framesets.append(frameset)
                 if len(framesets) == self._options.temporal_frames:
                     color, depth_m = self._images.make(framesets)
                     framesets.clear()
-                    _check_images(color, depth_m)
+                    check_images(color, depth_m)
                     return RgbdFrame(t, number, color, depth_m, self._images.intrinsics, self._serial)
             except DeviceFault as fault:
                 problem = str(fault)
-        raise DeviceFault(problem) if problem else ConnectionLost(silence)
+        raise DeviceFault(problem, device="camera") if problem else ConnectionLost(silence, device="camera")
 
     def _connect(self) -> None:
         rs = load_pyrealsense2()
@@ -182,51 +155,23 @@ class D415(Camera):
         config = rs.config()
         config.enable_stream(rs.stream.depth, 0, width, height, rs.format.z16, FRAMES_PER_S)
         config.enable_stream(rs.stream.color, 0, width, height, rs.format.rgb8, FRAMES_PER_S)
-        if self._options.source == "usb" or "://" in self._options.source:
-            context = self._open_source(rs)
+        if self._recorded:
+            context = rs.context()
+            device = open_recording(rs, context, config, Path(self._options.source), self._options.serial)
+        else:
+            if self._options.source == "usb":
+                context = rs.context()
+            else:
+                self._source = open_source(self._options.source, self._mount.resolution)
+                context = self._source.context
             device = find_device(context, self._options.serial)
             check_usb(device)
             config.enable_device(serial_number(device))
-        else:
-            context = rs.context()
-            device = self._open_recording(rs, context, config)
         self._serial = serial_number(device)
         self.description = describe_device(device)
         if self._mount.measured is not None:
             self._mount.measured.check(serial=self._serial, resolution=(width, height))
         self._start(rs, context, config, device)
-
-    def _open_source(self, rs: Any) -> Any:
-        """The context in which the camera is to be found."""
-        if self._options.source == "usb":
-            return rs.context()
-        name, _, address = self._options.source.partition("://")
-        installed = {entry.name: entry for entry in entry_points(group="robotcell.camera_sources")}
-        if name not in installed:
-            raise ConfigError(
-                f"camera: no source of frames is called {name!r}; installed: {', '.join(sorted(installed)) or 'none'}"
-            )
-        try:
-            open_source = installed[name].load()
-        except ImportError as error:
-            raise ConfigError(f"camera: the source {name!r} cannot be imported ({error}); install its extra") from error
-        self._source = open_source(address, self._mount.resolution)
-        return self._source.context
-
-    def _open_recording(self, rs: Any, context: Any, config: Any) -> Any:
-        """The device that a recorded file holds."""
-        path = Path(self._options.source)
-        if not path.is_file():
-            raise ConfigError(f"camera: {path}: no such file; make one with robotcell twin record")
-        with sdk_errors(f"opening {path}"):
-            config.enable_device_from_file(str(path))
-            device = config.resolve(rs.pipeline_wrapper(rs.pipeline(context))).get_device()
-        if self._options.serial not in (None, serial_number(device)):
-            raise DeviceFault(
-                f"camera: {path} was recorded by {serial_number(device)}, and the option camera.serial asks for "
-                f"{self._options.serial}"
-            )
-        return device
 
     def _start(self, rs: Any, context: Any, config: Any, device: Any) -> None:
         for last_try in (False, False, True):
@@ -238,7 +183,7 @@ class D415(Camera):
             except ConnectionLost as error:
                 self._stop()
                 if last_try:
-                    raise ConnectionLost(f"{error} (tried three times)") from error
+                    raise ConnectionLost(f"{error} (tried three times)", device="camera") from error
 
     def _stream(self, rs: Any, context: Any, config: Any) -> None:
         """Start the streams, wait until exposure has settled, and see whether a frame can be used."""
@@ -246,11 +191,14 @@ class D415(Camera):
         with sdk_errors("starting the streams"):
             profile = pipeline.start(config)
         self._pipeline = pipeline
-        for i in range(_WARM_UP_FRAMES):
-            frameset = self._wait(_FRAME_S if i else _FIRST_FRAME_S)
+        self._frame_check = FrameCheck(self._clock, recorded=self._recorded)
+        for i in range(self._options.warm_up_frames):
+            frameset = self._wait(_FRAME_S if i else self._options.first_frame_timeout_s)
             if frameset is None:
-                raise ConnectionLost(f"camera: its streams are started, but no frame comes; {USB_ADVICE}")
-            self._last_number = frameset.get_frame_number()
+                raise ConnectionLost(
+                    f"camera: its streams are started, but no frame comes; {USB_ADVICE}", device="camera"
+                )
+            self._frame_check.skip(frameset)
         self._images = D415Images(profile, self._options.spatial_filter)
         self.read()
 
@@ -272,7 +220,6 @@ class D415(Camera):
 
     def _stop(self) -> None:
         pipeline, self._pipeline, self._images = self._pipeline, None, None
-        self._last_number, self._earlier_numbers = -1, 0
         if pipeline is not None:
             with suppress(RuntimeError):  # the device is gone
                 pipeline.stop()
@@ -282,56 +229,3 @@ class D415(Camera):
         with sdk_errors("waiting for a frame"):
             came, frameset = self._pipeline.try_wait_for_frames(max(1, round(seconds * 1000)))
         return frameset if came else None
-
-    def _check(self, frameset: Any, called: float) -> tuple[float, int]:
-        """Time of capture on the cell's clock [s] and number of a frameset.
-
-        Raises:
-            DeviceFault: it is not to be used.
-        """
-        depth, color = frameset.get_depth_frame(), frameset.get_color_frame()
-        if not depth or not color:
-            raise DeviceFault(f"camera: frames come without {'colour' if depth else 'depth'}; {USB_ADVICE}")
-        # Two streams that do not match come in turn, each with the last frame of the other.
-        apart_s = abs(depth.get_timestamp() - color.get_timestamp()) / 1000
-        if apart_s > _SAME_MOMENT_S:
-            raise DeviceFault(
-                f"camera: colour and depth are {apart_s:.2f} s apart: one of the streams lags or stands still; "
-                "connect again"
-            )
-        number = depth.get_frame_number() + self._earlier_numbers
-        if number <= self._last_number:
-            if not self._recorded:
-                raise DeviceFault(f"camera: it repeats frame {number}: its stream is frozen; plug it in again")
-            # The recording has begun again.
-            self._earlier_numbers += self._last_number + 1 - number
-            number = self._last_number + 1
-        self._last_number = number
-        t = min(self._time_of(depth), self._time_of(color))
-        if t < called:
-            raise DeviceFault(
-                f"camera: the newest frame is {self._clock.now() - t:.2f} s old: frames come late; is the machine, or "
-                "the USB port, overloaded?"
-            )
-        return t, number
-
-    def _time_of(self, frame: Any) -> float:
-        """Time of capture on the cell's clock [s]; where the camera does not tell, not later than it can be."""
-        rs, now = load_pyrealsense2(), self._clock.now()
-        if self._recorded:
-            return now
-        domain = frame.get_frame_timestamp_domain()
-        if domain == rs.timestamp_domain.hardware_clock:
-            return now - _TRANSFER_S
-        age_s = max(0.0, time.time() - float(frame.get_timestamp()) / 1000)
-        return now - age_s - (0.0 if domain == rs.timestamp_domain.global_time else _TRANSFER_S)
-
-
-def _check_images(color: npt.NDArray[np.uint8], depth_m: npt.NDArray[np.float32]) -> None:
-    if np.count_nonzero(depth_m) < _MIN_DEPTH_SHARE * depth_m.size:
-        raise DeviceFault(
-            "camera: nothing in the image has depth; is a lens covered, or is something nearer than 0.3 m (0.45 m at "
-            "1280x720)?"
-        )
-    if color[::8, ::8].mean() < _MIN_BRIGHTNESS:
-        raise DeviceFault("camera: the colour image is black; is the lens covered, or the light off?")

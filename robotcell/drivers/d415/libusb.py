@@ -34,5 +34,6 @@ def load_libusb(sdk: str, extra: str) -> None:
     except (ImportError, OSError) as error:
         raise ConfigError(
             f"{sdk} needs {_LIBUSB}; neither the system nor the package libusb-package has it ({error}): "
-            f"pip install 'robotcell[{extra}]'"
+            f"pip install 'robotcell[{extra}]'",
+            device="camera",
         ) from error

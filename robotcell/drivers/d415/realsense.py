@@ -34,7 +34,7 @@ def load_pyrealsense2() -> Any:
         return importlib.import_module("pyrealsense2")
     except ImportError as error:
         raise ConfigError(
-            f"the camera's library cannot be loaded ({error}): pip install 'robotcell[hardware]'"
+            f"the camera's library cannot be loaded ({error}): pip install 'robotcell[hardware]'", device="camera"
         ) from error
 
 
@@ -58,14 +58,16 @@ def sdk_errors(doing: str) -> Iterator[None]:
         if "busy" in text.lower() or "is streaming" in text:
             raise DeviceFault(
                 f"camera: {doing} failed ({text}): another program uses the camera; close it (a viewer, another job), "
-                "then connect again"
+                "then connect again",
+                device="camera",
             ) from error
         if "resolve requests" in text:
             raise DeviceFault(
                 f"camera: {doing} failed ({text}): the camera does not offer this mode. Set camera.resolution to one "
-                f"that it has; where it should have it, {USB_ADVICE}"
+                f"that it has; where it should have it, {USB_ADVICE}",
+                device="camera",
             ) from error
-        raise ConnectionLost(f"camera: {doing} failed ({text}): {USB_ADVICE}") from error
+        raise ConnectionLost(f"camera: {doing} failed ({text}): {USB_ADVICE}", device="camera") from error
 
 
 def find_device(context: Any, serial: str | None) -> Any:
@@ -82,18 +84,20 @@ def find_device(context: Any, serial: str | None) -> Any:
     with sdk_errors("looking for cameras"):
         found = {serial_number(device): device for device in context.query_devices()}
     if not found:
-        raise ConnectionLost(f"camera: no RealSense camera is connected; {_ABSENT_ADVICE}")
+        raise ConnectionLost(f"camera: no RealSense camera is connected; {_ABSENT_ADVICE}", device="camera")
     if serial is None and len(found) > 1:
         raise DeviceFault(
             f"camera: {len(found)} cameras are connected ({', '.join(sorted(found))}); say which one is the cell's by "
-            "the option camera.serial"
+            "the option camera.serial",
+            device="camera",
         )
     if serial is None:
         return next(iter(found.values()))
     if serial not in found:
         raise ConnectionLost(
             f"camera: {serial} is not connected, only {', '.join(sorted(found))}; plug in the right camera, or correct "
-            "the option camera.serial"
+            "the option camera.serial",
+            device="camera",
         )
     return found[serial]
 
@@ -137,4 +141,7 @@ def check_usb(device: Any) -> None:
             return
         usb = device.get_info(rs.camera_info.usb_type_descriptor)
     if usb.startswith(("1", "2")):
-        raise DeviceFault(f"camera: it is connected by USB {usb}, which is too slow for depth and colour; {USB_ADVICE}")
+        raise DeviceFault(
+            f"camera: it is connected by USB {usb}, which is too slow for depth and colour; {USB_ADVICE}",
+            device="camera",
+        )

@@ -1,1 +1,1 @@
-"""Looks at every device of a hardware cell and says what is wrong."""
+"""Looks at every device of a hardware cell and says what is wrong. Start at `examine`."""

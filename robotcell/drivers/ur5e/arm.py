@@ -1,4 +1,4 @@
-"""The UR5e over ur_rtde 1.6, which runs in a child process of its own: `ur5e_child`.
+"""The UR5e over ur_rtde 1.6, which runs in a child process of its own: `child`.
 
 This side judges: it inspects the controller before ur_rtde is let near it, refuses what the controller could not do,
 takes a state that is too old, a child that died or a command that is not answered for a lost connection, and holds the
@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from robotcell.drivers.unconfirmed import warn_unconfirmed
+from robotcell.drivers.ur5e.child_process import ChildProcess
 from robotcell.drivers.ur5e.controller import arm_mode, inspect, obstacles, program_held, slow_slider, why_not_ready
 from robotcell.drivers.ur5e.dashboard import Dashboard
-from robotcell.drivers.ur5e.link import ChildProcess, Setup, StartJoints, StartLinear
+from robotcell.drivers.ur5e.messages import Setup, StartJoints, StartLinear
 from robotcell.errors import CellError, ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import rg2
 from robotcell.geometry.controller_ranges import check_joint_motion, check_linear_motion
@@ -92,7 +93,7 @@ class UR5e(Arm):
                 return
         self.close()
         if importlib.util.find_spec("rtde_control") is None:
-            raise ConfigError("ur_rtde is not installed: pip install 'robotcell[hardware]'")
+            raise ConfigError("ur_rtde is not installed: pip install 'robotcell[hardware]'", device="arm")
         warn_unconfirmed("UR5e")
         try:
             controller, held = self._inspect_idle()
@@ -213,7 +214,9 @@ class UR5e(Arm):
             controller, held = self._inspect_idle()
             self._check(controller)
             if held or controller.protective_stop:
-                raise DeviceFault(f"the arm at {self._options.host}: {held or 'the protective stop came back'}")
+                raise DeviceFault(
+                    f"the arm at {self._options.host}: {held or 'the protective stop came back'}", device="arm"
+                )
             self._start_child(control=True)
         except BaseException:
             self.close()
@@ -224,12 +227,15 @@ class UR5e(Arm):
         self._dashboard.ask("close safety popup")
         answer = self._dashboard.ask("unlock protective stop")
         if "releasing" not in answer:
-            raise DeviceFault(f"the protective stop cannot be left from here: {answer}; clear it at the pendant")
+            raise DeviceFault(
+                f"the protective stop cannot be left from here: {answer}; clear it at the pendant", device="arm"
+            )
         deadline = time.monotonic() + _RELEASE_S
         while _mode(self._record()) is ArmMode.PROTECTIVE_STOP:
             if time.monotonic() > deadline:
                 raise DeviceFault(
-                    "the protective stop came back at once: free the arm with freedrive at the pendant, then recover"
+                    "the protective stop came back at once: free the arm with freedrive at the pendant, then recover",
+                    device="arm",
                 )
             self._clock.sleep(_POLL_S)
 
@@ -247,7 +253,7 @@ class UR5e(Arm):
     def _check(self, controller: Controller) -> None:
         found = obstacles(controller)
         if found:
-            raise DeviceFault("\n  ".join([f"the arm at {self._options.host} cannot be driven:", *found]))
+            raise DeviceFault("\n  ".join([f"the arm at {self._options.host} cannot be driven:", *found]), device="arm")
 
     def _start_child(self, *, control: bool) -> None:
         options = self._options
@@ -262,7 +268,7 @@ class UR5e(Arm):
         self._child = ChildProcess.start()
         refusal = self._child.ask(setup).refusal
         if refusal:
-            raise DeviceFault(f"the arm at {options.host}: {refusal}")
+            raise DeviceFault(f"the arm at {options.host}: {refusal}", device="arm")
 
     def _start(self, motion: StartJoints | StartLinear) -> None:
         child = self._need_child()
@@ -273,23 +279,25 @@ class UR5e(Arm):
             raise self._lose(str(error)) from None
         if refusal:
             record = self._record()
-            raise DeviceFault(f"{refusal}; {why_not_ready(int(record['robot_mode']), int(record['safety_mode']))}")
+            raise DeviceFault(
+                f"{refusal}; {why_not_ready(int(record['robot_mode']), int(record['safety_mode']))}", device="arm"
+            )
 
     def _need_ready(self) -> None:
         record = self._record()
         if _mode(record) is not ArmMode.READY:
-            raise DeviceFault(why_not_ready(int(record["robot_mode"]), int(record["safety_mode"])))
+            raise DeviceFault(why_not_ready(int(record["robot_mode"]), int(record["safety_mode"])), device="arm")
         if record["moving"]:
-            raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it")
+            raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it", device="arm")
         slow = slow_slider(float(record["speed_fraction"]))
         if slow:
-            raise DeviceFault(f"the arm would not move: {slow}")
+            raise DeviceFault(f"the arm would not move: {slow}", device="arm")
 
     def _need_child(self) -> ChildProcess:
         if self._child is None:
             if self._lost:
-                raise ConnectionLost(f"the arm was lost ({self._lost}): connect it again")
-            raise ConnectionLost("the arm is not connected: connect it first")
+                raise ConnectionLost(f"the arm was lost ({self._lost}): connect it again", device="arm")
+            raise ConnectionLost("the arm is not connected: connect it first", device="arm")
         return self._child
 
     def _record(self) -> np.void:
@@ -317,7 +325,9 @@ class UR5e(Arm):
             self._dashboard.send("stop")
         self._dashboard.close()
         self._lost = f"{reason}; check the controller and the cable, see robotcell doctor"
-        return ConnectionLost(f"the arm at {self._options.host} is lost: {self._lost}, then connect again")
+        return ConnectionLost(
+            f"the arm at {self._options.host} is lost: {self._lost}, then connect again", device="arm"
+        )
 
 
 def _mode(record: np.void) -> ArmMode:

@@ -1,325 +1,31 @@
 """The child process of the UR5e driver: the only place where ur_rtde runs. `python -m robotcell.drivers.ur5e.child`.
 
-One thread does everything, so that a command never meets another one. It leaves by `os._exit`: the destructors of
-ur_rtde can hang for ever. A timer of the kernel ends it when ur_rtde holds it for too long, whatever holds the
-interpreter's lock. From the moment it is gone nobody kicks the controller's watchdog, which then stops the arm.
+It leaves by `os._exit`: the destructors of ur_rtde can hang for ever. A timer of the kernel ends it when ur_rtde holds
+it for too long, whatever holds the interpreter's lock. From the moment it is gone nobody kicks the controller's
+watchdog, which then stops the arm.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import sys
-import time
-from collections import deque
 from contextlib import suppress
 from mmap import mmap
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
-from robotcell.drivers.ur5e.controller import IN_USE_CURE, PLAYING, PROTECTIVE_STOP, STOPPED
-from robotcell.drivers.ur5e.link import (
-    STATE,
-    SUPERVISION,
-    SUPERVISION_OFFSET,
-    Answer,
-    Close,
-    Setup,
-    StartJoints,
-    StartLinear,
-)
-from robotcell.interfaces import KICK_TIMEOUT_S
-from robotcell.io.shared_record import SharedRecord
+from robotcell.drivers.ur5e.messages import Answer, Close, StartJoints, StartLinear
+from robotcell.drivers.ur5e.session import Session
+from robotcell.errors import ConnectionLost
 
 if TYPE_CHECKING:
-    from robotcell.drivers.ur5e.link import Request
+    from robotcell.drivers.ur5e.messages import Request
 
-STATE_HZ = 125.0
-_CONTROL_HZ = 500.0
 _TICK_S = 0.004
-_VARIABLES = [
-    "timestamp",
-    "actual_q",
-    "actual_qd",
-    "actual_TCP_pose",
-    "actual_TCP_force",
-    "robot_mode",
-    "safety_mode",
-    "runtime_state",
-    "target_speed_fraction",
-    "payload",
-    "payload_cog",
-]
-# The controller ends our program when no packet came for 1 / this: while a motion is under way, and while the arm
-# stands, when a busy computer must not cost the program.
-_MOVING_WATCHDOG_HZ = 8.0
-_IDLE_WATCHDOG_HZ = 1.0
-_KICK_PERIOD_S = 0.02
 # How long ur_rtde may hold this process: while it connects and uploads its program, and afterwards.
 _SETUP_LASTS_S = 7.5
 _HANG_S = 2.0
-_PROGRAM_STARTS_S = 4.0
-_SETTING_APPLIES_S = 1.0
-# A motion that was accepted begins within some milliseconds.
-_MOTION_BEGINS_S = 0.5
-_LAST_STOP_S = 0.6
-# What ur_rtde brakes with unless told otherwise [m/s^2].
-_STOP_DECELERATION_M_S2 = 10.0
-_STANDS_RAD_S = 0.015
-_SETTLES_S = 0.2
-# The offset between two clocks is the smallest that was seen in this and the previous period of so many seconds: it
-# drifts by less than a millisecond in that time.
-_OFFSET_PERIOD_S = 10.0
-# Uploading is left to us: with the library's default its own thread uploads the program again after a lost connection.
-_FLAG_NO_WAIT = 16
-
-
-class _ClockOffset:
-    """From the controller's time stamps to time.monotonic(): a packet is never older than its fastest sibling says."""
-
-    def __init__(self) -> None:
-        self._periods: deque[tuple[float, float]] = deque(maxlen=2)
-
-    def to_local(self, stamp: float) -> float:
-        """Time.monotonic() [s] of the controller's `stamp` [s], of a packet that has just come in."""
-        now = time.monotonic()
-        offset = now - stamp
-        if not self._periods or now - self._periods[-1][0] > _OFFSET_PERIOD_S:
-            self._periods.append((now, offset))
-        elif offset < self._periods[-1][1]:
-            self._periods[-1] = (self._periods[-1][0], offset)
-        return stamp + min(offset for _, offset in self._periods)
-
-
-class _Session:
-    """A connected controller."""
-
-    def __init__(self, setup: Setup, pipe: Connection, memory: mmap) -> None:
-        from rtde_receive import RTDEReceiveInterface
-
-        self._pipe = pipe
-        self._state = SharedRecord(STATE, memory)
-        self._supervision = SharedRecord(SUPERVISION, memory, SUPERVISION_OFFSET)
-        self._offset = _ClockOffset()
-        self._stamp = 0.0
-        self._stopped_at = 0.0
-        self._receive = RTDEReceiveInterface(setup.host, STATE_HZ, _VARIABLES)
-        self._control: Any = None
-        # Set for good when our program is interrupted: a program that is resumed at the pendant is never kicked again.
-        self._interrupted = False
-        self._moving = False
-        self._watchdog_hz = _IDLE_WATCHDOG_HZ
-        # Number of the operation before the one that moves the arm or brakes it, and when that was commanded.
-        self._operation = 0
-        self._commanded_at = 0.0
-        self._ended_at = math.inf
-        self._stops = 0
-        self._stop_sent = False
-        self._kick_due = 0.0
-        self._publish()
-
-    def take_control(self, setup: Setup) -> str:
-        """Start our program and set the tool; "" or why that was refused."""
-        from rtde_control import RTDEControlInterface
-
-        try:
-            self._control = RTDEControlInterface(setup.host, _CONTROL_HZ, _FLAG_NO_WAIT)
-        except RuntimeError as error:
-            return IN_USE_CURE if "in use" in str(error) else f"the controller refuses to be controlled: {error}"
-        self._control.reuploadScript()
-        if not _wait_for(self._playing, _PROGRAM_STARTS_S):
-            return (
-                "the controller does not start the program that was sent to it: look at the pendant for a message, "
-                "and check that the arm is powered on and in remote control"
-            )
-        if not self._control.setTcp(list(setup.tcp_offset)) or not _close(
-            self._control.getTCPOffset(), setup.tcp_offset
-        ):
-            return "the controller does not take the tool's centre point: check the installation at the pendant"
-        cog = list(setup.payload_cog)
-        payload_set = self._control.setPayload(setup.payload_kg, cog) and _wait_for(
-            lambda: (
-                _close([self._receive.getPayload()], [setup.payload_kg]) and _close(self._receive.getPayloadCog(), cog)
-            ),
-            _SETTING_APPLIES_S,
-        )
-        if not payload_set:
-            return "the controller does not take the tool's mass: check arm.payload_kg and arm.payload_cog"
-        if not self._control.setWatchdog(_IDLE_WATCHDOG_HZ):
-            return "the controller does not arm its watchdog"
-        self._publish()
-        return ""
-
-    def run(self) -> NoReturn:
-        """Serve the driver until it closes, dies, or the controller is lost."""
-        while True:
-            signal.setitimer(signal.ITIMER_REAL, _HANG_S)
-            try:
-                request: Request | None = self._pipe.recv() if self._pipe.poll(_TICK_S) else None
-            except (EOFError, OSError):
-                self._end()
-            if isinstance(request, Close):
-                self._end()
-            self._check_link()
-            self._publish()
-            if isinstance(request, (StartJoints, StartLinear)):
-                self._pipe.send(Answer(self._start(request)))
-            if self._control is not None:
-                self._supervise()
-
-    def _check_link(self) -> None:
-        """Leave at once when a connection is gone: what ur_rtde does after that ends in a crash."""
-        if not self._receive.isConnected() or not (self._control is None or self._control.isConnected()):
-            leave("the controller closed the connection")
-
-    def _publish(self) -> None:
-        """Write the newest data package, and what we know of the motion."""
-        receive = self._receive
-        stamp = receive.getTimestamp()
-        while True:
-            fields = {
-                "q": receive.getActualQ(),
-                "qd": receive.getActualQd(),
-                "tcp_pose": receive.getActualTCPPose(),
-                "tcp_force": receive.getActualTCPForce(),
-                "robot_mode": receive.getRobotMode(),
-                "safety_mode": receive.getSafetyMode(),
-                "runtime_state": receive.getRuntimeState(),
-                "speed_fraction": receive.getTargetSpeedFraction(),
-            }
-            before, stamp = stamp, receive.getTimestamp()
-            if stamp == before:
-                break
-        if stamp != self._stamp:
-            self._stamp = stamp
-            fields["t"] = self._offset.to_local(stamp)
-        if fields["safety_mode"] != PROTECTIVE_STOP:
-            self._stopped_at = 0.0
-        elif not self._stopped_at:
-            self._stopped_at = time.monotonic()
-        if self._control is not None:
-            self._judge_motion(fields["qd"])
-        self._state.write(
-            **fields,
-            ready=self._control is not None and not self._interrupted,
-            moving=self._moving,
-            stops=self._stops,
-            stopped_at=self._stopped_at,
-        )
-
-    def _playing(self) -> bool:
-        return bool(self._receive.getRuntimeState() == PLAYING and self._control.isProgramRunning())
-
-    def _judge_motion(self, qd: list[float]) -> None:
-        """Whether the motion under way has ended, by its operation number or because the program was interrupted."""
-        if not self._playing():
-            self._interrupted = True
-            self._moving = self._moving and max(map(abs, qd)) > _STANDS_RAD_S
-        elif self._moving:
-            status = self._control.getAsyncOperationProgressEx()
-            if status.operationId() != self._operation:
-                if status.isAsyncOperationRunning():
-                    self._ended_at = math.inf
-                else:
-                    # The joints follow their targets with a delay: the motion ends when they stand.
-                    self._ended_at = min(self._ended_at, time.monotonic())
-                    settled = max(map(abs, qd)) < _STANDS_RAD_S
-                    self._moving = not settled and time.monotonic() - self._ended_at < _SETTLES_S
-            elif time.monotonic() - self._commanded_at > _MOTION_BEGINS_S:
-                leave("the controller took a motion and did not begin it")
-
-    def _start(self, motion: StartJoints | StartLinear) -> str:
-        """Start a motion; "" or why that was refused."""
-        if self._control is None or self._interrupted:
-            return "the controller does not run our program"
-        if not self._set_watchdog(_MOVING_WATCHDOG_HZ):
-            return "the controller did not arm its watchdog"
-        operation = self._control.getAsyncOperationProgressEx().operationId()
-        if isinstance(motion, StartJoints):
-            taken = self._control.moveJ(list(motion.q), motion.speed_rad_s, motion.acceleration_rad_s2, True)
-        else:
-            taken = self._control.moveL(list(motion.tcp_pose), motion.speed_m_s, motion.acceleration_m_s2, True)
-        if not taken:
-            return "the controller did not take the motion"
-        self._operation, self._commanded_at = operation, time.monotonic()
-        self._moving, self._stop_sent, self._ended_at = True, False, math.inf
-        self._state.write(moving=True)
-        return ""
-
-    def _supervise(self) -> None:
-        """Stop when asked to, or when nobody supervises the motion; and keep the controller's watchdog quiet."""
-        now = time.monotonic()
-        supervision = self._supervision.read()
-        if int(supervision["stops"]) != self._stops:
-            if self._stop():
-                self._stops = int(supervision["stops"])
-                self._state.write(stops=self._stops)
-        elif self._moving and not self._stop_sent and now - float(supervision["kicked"]) > KICK_TIMEOUT_S:
-            self._stop()
-        if self._interrupted:
-            return
-        if not self._moving:
-            self._set_watchdog(_IDLE_WATCHDOG_HZ)
-        self._kick(now)
-
-    def _set_watchdog(self, frequency_hz: float) -> bool:
-        if frequency_hz != self._watchdog_hz:
-            if not self._control.setWatchdog(frequency_hz):
-                return False
-            self._watchdog_hz = frequency_hz
-        return True
-
-    def _kick(self, now: float) -> None:
-        if now >= self._kick_due:
-            self._control.kickWatchdog()
-            self._kick_due = now + _KICK_PERIOD_S
-
-    def _stop(self) -> bool:
-        """Brake; whether the controller was told, or has nothing to stop."""
-        if not self._playing():
-            # A paused program could be resumed: only the dashboard can end it.
-            return bool(self._receive.getRuntimeState() == STOPPED)
-        if self._moving and not self._stop_sent:
-            operation = self._control.getAsyncOperationProgressEx().operationId()
-            self._control.stopL(_STOP_DECELERATION_M_S2, True)
-            self._operation, self._commanded_at = operation, time.monotonic()
-            self._stop_sent = True
-        return True
-
-    def _end(self) -> NoReturn:
-        """Stop the arm, end our program and leave."""
-        if self._control is not None and not self._interrupted:
-            self._stop()
-            _wait_for(self._stands, _LAST_STOP_S)
-            if self._playing():
-                self._control.stopScript()
-        leave("")
-
-    def _stands(self) -> bool:
-        self._judge_motion(self._receive.getActualQd())
-        if self._moving:
-            self._kick(time.monotonic())
-        return not self._moving
-
-
-def leave(reason: str) -> NoReturn:
-    """End this process without running a destructor of ur_rtde; the driver reads the reason from the log."""
-    print(reason, file=sys.stderr, flush=True)  # noqa: T201
-    os._exit(1 if reason else 0)
-
-
-def _wait_for(condition: Any, timeout_s: float) -> bool:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(_TICK_S)
-    return True
-
-
-def _close(values: Any, wanted: Any) -> bool:
-    return len(values) == len(wanted) and all(abs(a - b) < 1e-4 for a, b in zip(values, wanted, strict=True))
 
 
 def main() -> NoReturn:
@@ -332,13 +38,39 @@ def main() -> NoReturn:
     pipe, memory = Connection(int(sys.argv[1])), mmap(int(sys.argv[2]), 0)
     try:
         setup = pipe.recv()
-        session = _Session(setup, pipe, memory)
+        session = Session(setup, memory)
         pipe.send(Answer(session.take_control(setup) if setup.control else ""))
-        session.run()
+        _serve(session, pipe)
+    except ConnectionLost as error:
+        _leave(str(error))
     except (EOFError, OSError):
-        leave("the driver is gone")
+        _leave("the driver is gone")
     except BaseException as error:
-        leave(f"{type(error).__name__}: {error}")
+        _leave(f"{type(error).__name__}: {error}")
+    _leave("")
+
+
+def _serve(session: Session, pipe: Connection) -> None:
+    """Serve the driver until it closes or dies; ConnectionLost ends it too."""
+    while True:
+        signal.setitimer(signal.ITIMER_REAL, _HANG_S)
+        try:
+            request: Request | None = pipe.recv() if pipe.poll(_TICK_S) else None
+        except (EOFError, OSError):
+            request = Close()
+        if isinstance(request, Close):
+            session.end()
+            return
+        session.publish()
+        if isinstance(request, (StartJoints, StartLinear)):
+            pipe.send(Answer(session.start(request)))
+        session.supervise()
+
+
+def _leave(reason: str) -> NoReturn:
+    """End this process without running a destructor of ur_rtde; the driver reads the reason from the log."""
+    print(reason, file=sys.stderr, flush=True)  # noqa: T201
+    os._exit(1 if reason else 0)
 
 
 if __name__ == "__main__":

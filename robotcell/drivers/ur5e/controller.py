@@ -107,7 +107,8 @@ def inspect(host: str) -> Controller:
     except ConnectionLost as error:
         raise ConnectionLost(
             f"the arm: {error}; check that the controller has booted, arm.host, the cable, and that its services are "
-            "enabled (Settings > Security > Services at the pendant)"
+            "enabled (Settings > Security > Services at the pendant)",
+            device="arm",
         ) from None
     return Controller(
         version=version,
@@ -213,4 +214,4 @@ def _probe_script_port(host: str) -> None:
     try:
         socket.create_connection((host, SCRIPT_PORT), TIMEOUT_S).close()
     except OSError as error:
-        raise ConnectionLost(f"{host}:{SCRIPT_PORT} (script) cannot be reached: {error}") from error
+        raise ConnectionLost(f"{host}:{SCRIPT_PORT} (script) cannot be reached: {error}", device="arm") from error

@@ -30,10 +30,12 @@ class Dashboard:
         try:
             self._socket = socket.create_connection((self._host, PORT), TIMEOUT_S)
         except OSError as error:
-            raise ConnectionLost(f"{self._host}:{PORT} (dashboard) cannot be reached: {error}") from error
+            raise ConnectionLost(f"{self._host}:{PORT} (dashboard) cannot be reached: {error}", device="arm") from error
         greeting = self._line()
         if "Dashboard Server" not in greeting:
-            raise ConnectionLost(f"{self._host}:{PORT} greets with {greeting!r}; a dashboard server is needed")
+            raise ConnectionLost(
+                f"{self._host}:{PORT} greets with {greeting!r}; a dashboard server is needed", device="arm"
+            )
 
     def close(self) -> None:
         """Close the connection. Idempotent."""
@@ -67,11 +69,13 @@ class Dashboard:
             self._pending = b""
             connection.sendall(command.encode("ascii") + b"\n")
         except OSError as error:
-            raise ConnectionLost(f"{self._host}:{PORT} (dashboard): the connection broke: {error}") from error
+            raise ConnectionLost(
+                f"{self._host}:{PORT} (dashboard): the connection broke: {error}", device="arm"
+            ) from error
 
     def _connection(self) -> socket.socket:
         if self._socket is None:
-            raise ConnectionLost(f"{self._host}:{PORT} (dashboard) is not connected")
+            raise ConnectionLost(f"{self._host}:{PORT} (dashboard) is not connected", device="arm")
         return self._socket
 
     def _line(self) -> str:
@@ -82,11 +86,15 @@ class Dashboard:
                 connection.settimeout(max(deadline - time.monotonic(), 0.001))
                 more = connection.recv(4096)
             except TimeoutError:
-                raise ConnectionLost(f"{self._host}:{PORT} (dashboard) did not answer within {TIMEOUT_S:g} s") from None
+                raise ConnectionLost(
+                    f"{self._host}:{PORT} (dashboard) did not answer within {TIMEOUT_S:g} s", device="arm"
+                ) from None
             except OSError as error:
-                raise ConnectionLost(f"{self._host}:{PORT} (dashboard): the connection broke: {error}") from error
+                raise ConnectionLost(
+                    f"{self._host}:{PORT} (dashboard): the connection broke: {error}", device="arm"
+                ) from error
             if not more:
-                raise ConnectionLost(f"{self._host}:{PORT} (dashboard) closed the connection")
+                raise ConnectionLost(f"{self._host}:{PORT} (dashboard) closed the connection", device="arm")
             self._pending += more
         line, _, self._pending = self._pending.partition(b"\n")
         return line.decode("utf-8", "replace").strip()

@@ -59,7 +59,7 @@ def open_rtde(host: str) -> Iterator[RtdeReader]:
     try:
         connection = socket.create_connection((host, PORT), TIMEOUT_S)
     except OSError as error:
-        raise ConnectionLost(f"{host}:{PORT} (RTDE) cannot be reached: {error}") from error
+        raise ConnectionLost(f"{host}:{PORT} (RTDE) cannot be reached: {error}", device="arm") from error
     with connection:
         yield RtdeReader(host, connection)
 
@@ -149,4 +149,4 @@ class RtdeReader:
         return taken
 
     def _wrong(self, what: str) -> ConnectionLost:
-        return ConnectionLost(f"{self._host}:{PORT} (RTDE): {what}")
+        return ConnectionLost(f"{self._host}:{PORT} (RTDE): {what}", device="arm")

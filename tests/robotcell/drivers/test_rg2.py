@@ -2,52 +2,31 @@
 
 import re
 import socket
+import struct
 import threading
 import time
-from multiprocessing import resource_tracker
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
 from pymodbus.client import ModbusTcpClient
 
-from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
-from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.faults import Fault, Kind
+from tests.robotcell.drivers.served_cell import HOST, MODBUS_PORT
 from tests.sim_twin.cells import joints_at, tool_down
 
-HOST = "127.0.0.26"
 # Twice what a lost, silent or garbling device may hold the program for: computers that run tests are busy.
 BOUND_S = 2.0
 LIMIT_S = 20.0
 
 
-SCENE = """
-name = "one cube"
-[[object]]
-name = "cube"
-shape = "cube"
-color = "red"
-position = [0.0, 0.0, 0.025]
-"""
-
-
-@pytest.fixture(scope="module")
-def served(tmp_path_factory):
-    resource_tracker.ensure_running()
-    scene = tmp_path_factory.mktemp("scenes") / "cube.toml"
-    scene.write_text(SCENE, encoding="utf-8")
-    config = load_config(None, {"backend.options.scene": str(scene)})
-    with ServedCell(config, HOST, modbus_port=0, camera_port=0) as cell:
-        yield cell
-
-
 @pytest.fixture
 def options(served):
-    yield RG2Options(host=HOST, port=int(served.endpoints["modbus"].rpartition(":")[2]), timeout_s=0.3)
+    yield RG2Options(host=HOST, port=MODBUS_PORT, timeout_s=0.3)
     served.clear()
 
 
@@ -79,6 +58,7 @@ def fails_soon(call, error, words):
         except error as failure:
             assert time.monotonic() - began < BOUND_S
             assert re.search(words, str(failure)), failure
+            assert failure.device == "gripper"
             return
         time.sleep(0.01)
     pytest.fail("nothing failed")
@@ -162,8 +142,9 @@ def test_widths_are_between_the_tips_whatever_is_mounted(served, options, offset
         widest = min(0.11, 0.11 - 2 * offset)
         assert go(gripper, widest).width_m == pytest.approx(widest, abs=5e-4)
         for width in (widest + 0.001, max(0.0, -2 * offset) - 0.001):
-            with pytest.raises(UnsafeMotion, match="outside"):
+            with pytest.raises(UnsafeMotion, match="outside") as refusal:
                 gripper.start_width(width, 20.0)
+            assert refusal.value.device == "gripper"
     with RG2(options, WallClock()) as gripper:
         assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
 
@@ -287,9 +268,8 @@ def test_recover_leaves_a_gripper_that_is_free_as_it_is(served, gripper):
     assert not gripper.state().busy
 
 
-def test_recover_cannot_cure_a_switch_that_is_still_pushed(served, options, monkeypatch):
-    monkeypatch.setattr("robotcell.drivers.rg2._POWER_CYCLE_S", 2.0)
-    gripper = RG2(options, WallClock())
+def test_recover_cannot_cure_a_switch_that_is_still_pushed(served, options):
+    gripper = RG2(options.model_copy(update={"power_cycle_timeout_s": 2.0}), WallClock())
     inject(served, "state", Kind.WRONG, "s1")
     fails_soon(lambda: try_out(gripper), DeviceFault, "still pushed")
     with pytest.raises(DeviceFault, match="still pushed"):
@@ -334,19 +314,39 @@ def test_fingers_that_do_not_arrive_and_hold_nothing_are_a_fault(served, gripper
     assert go(gripper, 0.08).width_m == pytest.approx(0.08, abs=5e-4)
 
 
-def test_a_grip_bit_at_the_commanded_width_is_no_grip(served, gripper):
-    go(gripper, 0.05)
+def test_a_grip_bit_at_the_commanded_width_is_no_grip(served, options):
     inject(served, "state", Kind.WRONG, "grip")
-    soon(lambda: gripper._registers().status & 2)
-    assert not gripper.state().grip_detected
-    served.clear()
-    go(gripper, 0.08)
+    client = raw(options)
+    soon(lambda: client.read_holding_registers(268, count=1, device_id=65).registers[0] & 2)
+    client.close()
+    with RG2(options, WallClock()) as gripper:
+        assert not go(gripper, 0.05).grip_detected
+        served.clear()
+        go(gripper, 0.08)
 
 
-def test_another_device_is_not_driven(options, monkeypatch):
-    monkeypatch.setattr("robotcell.drivers.rg2._PRODUCTS", {0x20: "RG6"})
-    with pytest.raises(DeviceFault, match="is RG6, not an RG2"):
-        RG2(options, WallClock()).connect()
+@contextmanager
+def box_with(product):
+    """A Compute Box that tells the code of the device behind it, and nothing else; where it listens."""
+    with socket.create_server(("127.0.0.28", 0)) as server:
+
+        def serve():
+            connection, _ = server.accept()
+            with connection:
+                transaction = connection.recv(64)[:2]
+                connection.sendall(transaction + struct.pack(">HHBBBH", 0, 5, 65, 3, 2, product))
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield server.getsockname()
+        thread.join()
+
+
+@pytest.mark.parametrize(("product", "words"), [(0x21, "is RG6, not an RG2"), (0x99, r"an unknown device \(0x99\)")])
+def test_another_device_is_not_driven(product, words):
+    with box_with(product) as (host, port), pytest.raises(DeviceFault, match=words) as refusal:
+        RG2(RG2Options(host=host, port=port), WallClock()).connect()
+    assert refusal.value.device == "gripper"
 
 
 def test_close_stops_the_fingers_and_frees_the_box(served, options):

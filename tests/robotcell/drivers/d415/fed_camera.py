@@ -12,9 +12,27 @@ from robotcell.drivers.d415.realsense import load_pyrealsense2
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
 SERIAL = "123456789012"
 PERIOD_S = 1 / 30
+
+
+# Those that were made and have not ended.
+_CAMERAS: list[FedCamera] = []
+
+
+def open_source(_address: str, _resolution: str) -> FedCamera:
+    """The entry point `fed` of `installed`: the newest camera."""
+    return _CAMERAS[-1]
+
+
+def install(folder: Path, module: str = __name__) -> None:
+    """Make a folder of the path a distribution whose source of frames is `fed`, opened by `module`."""
+    info = folder / "fed_camera-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fed-camera\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[robotcell.camera_sources]\nfed = {module}:open_source\n")
 
 
 class FedCamera:
@@ -28,6 +46,7 @@ class FedCamera:
         coeffs: distortion of the colour stream, Brown-Conrady.
         serial: of the device.
         domain: of the time stamps.
+        reset: what a hardware reset does; None for a device that cannot be reset.
     """
 
     def __init__(
@@ -40,6 +59,7 @@ class FedCamera:
         coeffs: tuple[float, ...] = (0.0,) * 5,
         serial: str = SERIAL,
         domain: str = "global_time",
+        reset: Callable[[], None] | None = None,
     ) -> None:
         self._rs = rs = load_pyrealsense2()
         self._pictures = depth, color
@@ -61,10 +81,11 @@ class FedCamera:
         place = rs.extrinsics()
         place.rotation, place.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [baseline_m, 0, 0]
         self._depth_profile.register_extrinsics_to(self._color_profile, place)
-        self.context = rs.context()
+        self.context = rs.context() if reset is None else _resettable_context(rs, reset)
         self._devices: list[Any] = []
         self.context.set_devices_changed_callback(lambda event: self._devices.append(event.get_new_devices()))
         self.device.add_to(self.context)
+        _CAMERAS.append(self)
         self._thread = threading.Thread(target=self._feed)
         self._thread.start()
 
@@ -73,6 +94,8 @@ class FedCamera:
 
     def end(self) -> None:
         """Stop showing anything."""
+        if self in _CAMERAS:
+            _CAMERAS.remove(self)
         self._ended.set()
         self._thread.join()
         self._devices.clear()
@@ -108,3 +131,23 @@ class FedCamera:
         stream.width, stream.height, stream.bpp, stream.fmt = optics.width, optics.height, size, pixel_format
         stream.intrinsics = optics
         return sensor.add_video_stream(stream, True)
+
+
+def _resettable_context(rs: Any, reset: Callable[[], None]) -> Any:
+    """A context whose devices are reset by a function: librealsense's software devices refuse to be."""
+
+    class Device:
+        def __init__(self, device: Any) -> None:
+            self._device = device
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._device, name)
+
+        def hardware_reset(self) -> None:
+            reset()
+
+    class Context(rs.context):  # type: ignore[misc]
+        def query_devices(self) -> list[Device]:
+            return [Device(device) for device in super().query_devices()]
+
+    return Context()

@@ -10,32 +10,25 @@ from pydantic import ValidationError
 
 from robotcell.config import CameraMount
 from robotcell.drivers.clock import WallClock
-from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.drivers.d415.realsense import load_pyrealsense2
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
-from tests.robotcell.drivers.d415.fed_camera import SERIAL, FedCamera
+from tests.robotcell.drivers.d415.fed_camera import SERIAL, FedCamera, install
 
 GREY = np.full((480, 640, 3), 90, np.uint8)
 WALL = np.full((480, 640), 900, np.uint16)
 FOCAL_PX = 617.3
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    """The exposure of these cameras has nothing to settle."""
-    monkeypatch.setattr(d415, "_WARM_UP_FRAMES", 3)
-
-
 @pytest.fixture
-def fed(monkeypatch):
+def fed(monkeypatch, tmp_path):
     """Makes devices; the driver finds the newest one as fed://."""
+    install(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
     devices = []
 
     def make(depth=WALL, color=GREY, **options):
         devices.append(FedCamera(depth, color, **options))
-        entry = SimpleNamespace(name="fed", load=lambda: lambda _address, _resolution: devices[-1])
-        monkeypatch.setattr(d415, "entry_points", lambda group: [entry])
         return devices[-1]
 
     yield make
@@ -44,7 +37,8 @@ def fed(monkeypatch):
 
 
 def camera(resolution="640x480", **options):
-    options = {"source": "fed://here", **options}
+    # The exposure of these cameras has nothing to settle.
+    options = {"source": "fed://here", "warm_up_frames": 3, **options}
     return D415(D415Options(**options), CameraMount(resolution=resolution), WallClock())
 
 
@@ -179,13 +173,13 @@ def test_several_cameras_need_a_serial_number(fed):
         camera().connect()
 
 
-def test_a_dead_camera_is_given_up_after_three_tries(fed, monkeypatch):
-    monkeypatch.setattr(d415, "_FIRST_FRAME_S", 0.1)
+def test_a_dead_camera_is_given_up_after_three_tries(fed):
     device = fed()
     device.feeding.clear()
-    driver = camera()
-    with pytest.raises(ConnectionLost, match=r"USB.*three times"):
+    driver = camera(first_frame_timeout_s=0.1)
+    with pytest.raises(ConnectionLost, match=r"USB.*three times") as lost:
         driver.connect()
+    assert lost.value.device == "camera"
     with pytest.raises(ConnectionLost, match="not connected"):
         driver.read()
     device.feeding.set()
@@ -193,42 +187,34 @@ def test_a_dead_camera_is_given_up_after_three_tries(fed, monkeypatch):
         driver.read()
 
 
-class Resettable:
-    """A device whose reset cures it."""
+class Hurried(WallClock):
+    """A wall clock on which nothing is waited for."""
 
-    def __init__(self, device, cure):
-        self._device = device
-        self._cure = cure
-
-    def __getattr__(self, name):
-        return getattr(self._device, name)
-
-    def hardware_reset(self):
-        self._cure()
+    def sleep(self, dt):
+        super().sleep(min(dt, 0.1))
 
 
-def test_a_hardware_reset_comes_last_and_may_help(fed, monkeypatch):
-    monkeypatch.setattr(d415, "_FIRST_FRAME_S", 0.1)
-    monkeypatch.setattr(d415, "_RESET_S", 0.1)
-    device = fed()
-    device.feeding.clear()
-    resets, starts = [], []
-    find, start = d415.find_device, D415._stream
+def test_a_hardware_reset_comes_last_and_may_help(fed):
+    resets = []
 
     def reset():
-        resets.append(len(starts))
+        resets.append(time.monotonic())
         device.feeding.set()
 
-    def stream(driver, *arguments):
-        starts.append(driver)
-        start(driver, *arguments)
-
-    monkeypatch.setattr(d415, "find_device", lambda *arguments: Resettable(find(*arguments), reset))
-    monkeypatch.setattr(D415, "_stream", stream)
-    with camera() as driver:
+    device = fed(reset=reset)
+    device.feeding.clear()
+    wait_s = 0.3
+    driver = D415(
+        D415Options(source="fed://here", warm_up_frames=3, first_frame_timeout_s=wait_s),
+        CameraMount(resolution="640x480"),
+        Hurried(),
+    )
+    begin = time.monotonic()
+    with driver:
         driver.read()
-    assert resets == [2]
-    assert len(starts) == 3
+    # Two tries have waited for a frame before it, and the third one needed no second reset.
+    assert len(resets) == 1
+    assert resets[0] - begin >= 2 * wait_s
 
 
 def test_closing_is_safe_at_any_time(fed):
@@ -252,12 +238,10 @@ def test_a_source_that_is_not_installed_is_named_among_those_that_are():
         camera(source="nobody://127.0.0.35:1").connect()
 
 
-def test_a_source_that_cannot_be_imported_says_so(monkeypatch):
-    def load():
-        raise ImportError("no module named x")
-
-    monkeypatch.setattr(d415, "entry_points", lambda group: [SimpleNamespace(name="fed", load=load)])
-    with pytest.raises(ConfigError, match="no module named x"):
+def test_a_source_that_cannot_be_imported_says_so(monkeypatch, tmp_path):
+    install(tmp_path, "no_such_module")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match="No module named 'no_such_module'"):
         camera().connect()
 
 
@@ -268,8 +252,9 @@ def test_an_address_that_is_none_is_refused(address):
 
 
 def test_nothing_at_the_address_is_lost():
-    with pytest.raises(ConnectionLost, match=r"127\.0\.0\.35:9.*robotcell twin serve"):
+    with pytest.raises(ConnectionLost, match=r"127\.0\.0\.35:9.*robotcell twin serve") as lost:
         camera(source="twin://127.0.0.35:9").connect()
+    assert lost.value.device == "camera"
 
 
 def test_no_such_camera_on_usb():

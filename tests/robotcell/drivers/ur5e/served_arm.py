@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
-from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from robotcell.config import CellConfig, load_config
+from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
 from robotcell.errors import CellError, ConnectionLost
 from robotcell.interfaces import ArmMode
-from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.faults import Fault, Kind
+from tests.robotcell.drivers.served_cell import HOST
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from robotcell.geometry.transforms import Array
+    from sim_twin.wire.cell import ServedCell
 
 PERIOD_S = 0.008
 # A controller that is lost, silent or garbling is an error within a second; a busy machine gets as much again.
@@ -32,33 +30,7 @@ STANDS_S = 0.3
 _STANDS_RAD_S = 0.02
 
 
-def config() -> CellConfig:
-    """A twin with one object."""
-    return load_config(None, {"backend.name": "twin", "backend.options.objects": 1})
-
-
-@contextmanager
-def served_arm(host: str, number: int) -> Iterator[ServedCell]:
-    """A served cell; `number` makes its ports its own."""
-    with ServedCell(config(), host, 15000 + number, 30400 + number) as served, _supervising():
-        yield served
-
-
-@contextmanager
-def _supervising() -> Iterator[None]:
-    """On a busy machine a test must not miss its periods: go ahead of everything else, where the system allows it."""
-    if sys.platform != "linux":
-        yield
-        return
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-
-
-def make_arm(host: str) -> UR5e:
+def make_arm(host: str = HOST) -> UR5e:
     """A driver, not yet connected."""
     return UR5e(UR5eOptions(host=host), WallClock())
 
@@ -93,7 +65,7 @@ def finish(arm: UR5e) -> None:
 
 def go_home(arm: UR5e) -> None:
     """Take the arm home."""
-    home = np.array(config().motion.home_q)
+    home = np.array(load_config().motion.home_q)
     if np.abs(arm.state().q - home).max() > 1e-3:
         arm.start_joints(home, 2.0, 4.0)
         finish(arm)

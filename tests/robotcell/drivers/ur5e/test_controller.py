@@ -81,8 +81,9 @@ def trickle(client: socket.socket) -> None:
 def refused(seconds: float, words: str) -> None:
     """The driver refuses with these words within a bound."""
     begin = time.monotonic()
-    with pytest.raises(ConnectionLost, match=words):
+    with pytest.raises(ConnectionLost, match=words) as lost:
         UR5e(UR5eOptions(host=HOST), WallClock()).connect()
+    assert lost.value.device == "arm"
     assert time.monotonic() - begin < seconds
 
 

@@ -19,6 +19,7 @@ from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import rg2
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
+from tests.robotcell.drivers.served_cell import HOST, serve
 from tests.robotcell.drivers.ur5e.served_arm import (
     LOST_S,
     STANDS_S,
@@ -29,7 +30,6 @@ from tests.robotcell.drivers.ur5e.served_arm import (
     joints,
     keep_moving,
     make_arm,
-    served_arm,
     stands_after,
     start_descent,
     wait_until,
@@ -38,31 +38,25 @@ from tests.robotcell.drivers.ur5e.served_arm import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from robotcell.drivers.ur5e.arm import UR5e
     from sim_twin.wire.cell import ServedCell
 
-HOST, NUMBER = "127.0.0.45", 45
-SECOND_HOST, SECOND_NUMBER = "127.0.0.44", 44
+SECOND_HOST, SECOND_PORTS = "127.0.0.44", (15044, 30444)
 
 
-@pytest.fixture(scope="module")
-def served() -> Iterator[ServedCell]:
-    with served_arm(HOST, NUMBER) as cell:
-        yield cell
-
-
-@pytest.fixture(scope="module")
-def second() -> Iterator[ServedCell]:
+@pytest.fixture
+def second(tmp_path: Path) -> Iterator[ServedCell]:
     """A cell that is not whole afterwards."""
-    with served_arm(SECOND_HOST, SECOND_NUMBER) as cell:
+    with serve(tmp_path, SECOND_HOST, *SECOND_PORTS) as cell:
         yield cell
 
 
 @pytest.fixture
 def arm(served: ServedCell) -> Iterator[UR5e]:
     """A connected arm at home; afterwards the cell is whole again."""
-    arm = make_arm(HOST)
+    arm = make_arm()
     try:
         works(arm)
         yield arm
@@ -106,7 +100,7 @@ def test_a_state_is_new_and_cheap(arm: UR5e) -> None:
 
 
 def test_a_second_client_only_watches(arm: UR5e, caplog: pytest.LogCaptureFixture) -> None:
-    with make_arm(HOST) as other:
+    with make_arm() as other:
         assert "a program is running" in caplog.text
         assert other.state().mode is ArmMode.NOT_READY
         with pytest.raises(DeviceFault, match="another program is on it"):
@@ -148,15 +142,16 @@ def test_the_arm_stands_when_the_child_dies(served: ServedCell, arm: UR5e, numbe
     assert child is not None
     assert stands_after(served, lambda: os.kill(child, number)) < STANDS_S
     assert is_lost(arm) < LOST_S
-    with pytest.raises(ConnectionLost, match="connect it again"):
+    with pytest.raises(ConnectionLost, match="connect it again") as lost:
         arm.moving  # noqa: B018
+    assert lost.value.device == "arm"
     assert not psutil.pid_exists(child)
     works(arm)
 
 
 OWNER = """
 import sys, time
-from tests.robotcell.drivers.served_arm import make_arm, start_descent, keep_moving
+from tests.robotcell.drivers.ur5e.served_arm import make_arm, start_descent, keep_moving
 arm = make_arm(sys.argv[1])
 arm.connect()
 start_descent(arm)

@@ -23,7 +23,6 @@ from tests.robotcell.drivers.ur5e.served_arm import (
     joints,
     keep_moving,
     make_arm,
-    served_arm,
     stands_after,
     start_descent,
     wait_until,
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
 
     from robotcell.drivers.ur5e.arm import UR5e
     from sim_twin.wire.cell import ServedCell
-
-HOST, NUMBER = "127.0.0.46", 46
 
 WRONG = Kind.WRONG
 # A connection that these hit in the middle of a motion is lost within a second, and the arm stands.
@@ -87,16 +84,10 @@ STOPPED = [
 ]
 
 
-@pytest.fixture(scope="module")
-def served() -> Iterator[ServedCell]:
-    with served_arm(HOST, NUMBER) as cell:
-        yield cell
-
-
 @pytest.fixture
 def closed_arm(served: ServedCell) -> Iterator[UR5e]:
     """An arm that is not connected; afterwards the cell is whole again."""
-    arm = make_arm(HOST)
+    arm = make_arm()
     try:
         yield arm
     finally:

@@ -5,7 +5,6 @@ import pytest
 
 from robotcell.config import CameraMount, load_config
 from robotcell.drivers.clock import WallClock
-from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import ConfigError, DeviceFault
 from sim_twin.d415.renderer import MODES
@@ -25,13 +24,10 @@ def recording(tmp_path_factory):
     return path
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch):
-    monkeypatch.setattr(d415, "_WARM_UP_FRAMES", 3)
-
-
 def player(path, resolution="640x480", **options):
-    return D415(D415Options(source=str(path), **options), CameraMount(resolution=resolution), WallClock())
+    return D415(
+        D415Options(source=str(path), warm_up_frames=3, **options), CameraMount(resolution=resolution), WallClock()
+    )
 
 
 def test_what_was_recorded_is_played_again_and_again(recording):

@@ -1,4 +1,4 @@
-"""Between the driver of the UR5e and the child process in which ur_rtde runs: the messages, the record and the process.
+"""The child process in which ur_rtde runs, as the driver of the UR5e sees it.
 
 ur_rtde can block for minutes, segfault or abort when a controller drops, stalls or sends garbage. Nothing here waits
 for the child longer than a bound, whatever has become of it.
@@ -13,99 +13,24 @@ import sys
 import tempfile
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing import Pipe
-from typing import TYPE_CHECKING, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO
 
-import numpy as np
-
-from robotcell.errors import ConnectionLost
+from robotcell.drivers.ur5e.messages import STATE, SUPERVISION, SUPERVISION_OFFSET, Answer, Close, Setup
+from robotcell.errors import ConnectionLost, StorageError
 from robotcell.io.shared_record import SharedRecord, record_size
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-# Written by the child with every data package. `t`: time.monotonic() [s] of the measurement. `ready`: our program runs
-# on the controller and was never interrupted. `stops`: how many stops were acted upon. `stopped_at`: time.monotonic()
-# [s] at which a protective stop was first seen, 0 without one.
-STATE = np.dtype(
-    [
-        ("t", "f8"),
-        ("q", "f8", 6),
-        ("qd", "f8", 6),
-        ("tcp_pose", "f8", 6),
-        ("tcp_force", "f8", 6),
-        ("robot_mode", "i4"),
-        ("safety_mode", "i4"),
-        ("runtime_state", "i4"),
-        ("speed_fraction", "f8"),
-        ("ready", "u1"),
-        ("moving", "u1"),
-        ("stops", "u8"),
-        ("stopped_at", "f8"),
-    ]
-)
-# Written by the driver. `kicked`: time.monotonic() [s] of the last sign of life; `stops`: how many were asked for.
-SUPERVISION = np.dtype([("kicked", "f8"), ("stops", "u8")])
-# The second record stands behind the first.
-SUPERVISION_OFFSET = record_size(STATE)
+    import numpy as np
+
+    from robotcell.drivers.ur5e.messages import Request
 
 # ur_rtde needs up to 5 s to find that a controller does not start its program.
 _SETUP_TIMEOUT_S = 8.0
 _ANSWER_TIMEOUT_S = 0.8
 _CLOSE_TIMEOUT_S = 1.5
-
-
-@dataclass(frozen=True)
-class Setup:
-    """The first message to a child: what to connect to, and what to set there.
-
-    Attributes:
-        host: address of the controller.
-        control: whether to start our program, or only to watch.
-        tcp_offset: pose (6,) [m, rad] of the tool centre point on the flange.
-        payload_kg: mass of the tool.
-        payload_cog: (3,) [m] its centre of gravity, flange axes.
-    """
-
-    host: str
-    control: bool
-    tcp_offset: tuple[float, ...]
-    payload_kg: float
-    payload_cog: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class StartJoints:
-    """Start a joint-space motion to q (6,) [rad]."""
-
-    q: tuple[float, ...]
-    speed_rad_s: float
-    acceleration_rad_s2: float
-
-
-@dataclass(frozen=True)
-class StartLinear:
-    """Start a straight motion of the tcp to a pose (6,) [m, rad]."""
-
-    tcp_pose: tuple[float, ...]
-    speed_m_s: float
-    acceleration_m_s2: float
-
-
-@dataclass(frozen=True)
-class Close:
-    """Stop the arm, end our program, and end."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What came of a message; `refusal` is "" if it was done."""
-
-    refusal: str = ""
-
-
-Request: TypeAlias = Setup | StartJoints | StartLinear | Close
 
 
 class ChildProcess:
@@ -122,23 +47,26 @@ class ChildProcess:
 
     @classmethod
     def start(cls) -> ChildProcess:
-        """Start a child; the next thing it waits for is a `Setup`."""
-        ours, theirs = Pipe()
-        # Memory and log have no name: whoever dies leaves nothing behind.
-        with theirs, tempfile.TemporaryFile() as memory_file:
-            log = tempfile.TemporaryFile()  # noqa: SIM115
-            memory_file.truncate(SUPERVISION_OFFSET + record_size(SUPERVISION))
+        """Start a child; the next thing it waits for is a `Setup`.
+
+        Raises:
+            StorageError: the folder for temporary files takes none.
+        """
+        with _temporary_file(SUPERVISION_OFFSET + record_size(SUPERVISION)) as memory_file:
+            log = _temporary_file()
             memory = mmap.mmap(memory_file.fileno(), 0)
-            fds = theirs.fileno(), memory_file.fileno()
-            process = subprocess.Popen(
-                [sys.executable, "-m", "robotcell.drivers.ur5e.child", *map(str, fds)],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                pass_fds=fds,
-                # An interrupt at the terminal is ours to handle: the child goes on until the arm stands.
-                start_new_session=True,
-            )
+            ours, theirs = Pipe()
+            with theirs:
+                fds = theirs.fileno(), memory_file.fileno()
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "robotcell.drivers.ur5e.child", *map(str, fds)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    pass_fds=fds,
+                    # An interrupt at the terminal is ours to handle: the child goes on until the arm stands.
+                    start_new_session=True,
+                )
         return cls(process, ours, memory, log)
 
     @property
@@ -159,8 +87,8 @@ class ChildProcess:
                 answer: Answer = self._pipe.recv()
                 return answer
         except (OSError, EOFError):
-            raise ConnectionLost(self.epitaph()) from None
-        raise ConnectionLost(f"the controller did not take a command within {timeout_s:g} s")
+            raise ConnectionLost(self.how_it_ended(), device="arm") from None
+        raise ConnectionLost(f"the controller did not take a command within {timeout_s:g} s", device="arm")
 
     def state(self) -> np.void:
         """The newest record.
@@ -169,7 +97,7 @@ class ChildProcess:
             ConnectionLost: the child died.
         """
         if self._process.poll() is not None:
-            raise ConnectionLost(self.epitaph())
+            raise ConnectionLost(self.how_it_ended(), device="arm")
         return self._state.read()
 
     def kick(self) -> None:
@@ -182,7 +110,7 @@ class ChildProcess:
         self._supervision.write(stops=self._stops)
         return self._stops
 
-    def epitaph(self) -> str:
+    def how_it_ended(self) -> str:
         """Words for a child that died: by which signal, and what it said last."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(0.2)
@@ -208,3 +136,22 @@ class ChildProcess:
         self._process.wait()
         self._pipe.close()
         self._log.close()
+
+
+def _temporary_file(size: int = 0) -> BinaryIO:
+    """A file of zeros without a name, so that whoever dies leaves nothing behind.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    try:
+        # Written, not only made longer: a full disk is found here, and not when the memory is used.
+        file: BinaryIO = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115
+        file.write(bytes(size))
+    except OSError as error:
+        raise StorageError(
+            f"the arm's driver cannot write a temporary file ({error}): make room in the folder for temporary files, "
+            "or name another one by TMPDIR",
+            device="arm",
+        ) from error
+    return file
