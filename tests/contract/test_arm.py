@@ -197,18 +197,19 @@ def test_refuses_poses_that_are_none(cell: Cell, pace: float) -> None:
     assert not cell.arm.moving
 
 
-def test_a_line_out_of_reach_leaves_an_arm_that_must_be_recovered(cell: Cell, opened: Opened) -> None:
+def test_a_line_out_of_reach_leaves_an_arm_that_must_be_recovered(closed_cell: Cell, opened: Opened) -> None:
     if opened.real:
         pytest.skip("a real arm is not sent to the end of its reach")
-    far = cell.arm.state().T_base_tcp.copy()
-    far[:3, 3] = (-2.0, 0.0, 0.3)
-    cell.arm.start_linear(far, 0.5, 1.0)
-    finish(cell)
-    assert cell.arm.state().mode is not ArmMode.READY
-    with pytest.raises(DeviceFault):
-        cell.arm.start_linear(far, 0.5, 1.0)
-    cell.arm.recover()
-    assert cell.arm.state().mode is ArmMode.READY
+    with closed_cell.arm as arm, closed_cell.gripper:
+        far = arm.state().T_base_tcp.copy()
+        far[:3, 3] = (-2.0, 0.0, 0.3)
+        arm.start_linear(far, 0.5, 1.0)
+        finish(closed_cell)
+        assert arm.state().mode is not ArmMode.READY
+        with pytest.raises(DeviceFault):
+            arm.start_linear(far, 0.5, 1.0)
+        arm.recover()
+        assert arm.state().mode is ArmMode.READY
 
 
 def test_recover_does_nothing_to_an_arm_that_is_ready(cell: Cell) -> None:
