@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.geometry import ur5e
-from sim_twin.wire.ur import motion as ur_motion
+from sim_twin.wire.shared_state import PERIOD_S
 from sim_twin.wire.ur.controller import Payload, Watchdog
-from sim_twin.wire.ur.motion import PERIOD_S, ForceMode, Motion, Move, ScriptError, checked
+from sim_twin.wire.ur.force_mode import ForceMode
+from sim_twin.wire.ur.moves import Move, follow
 from sim_twin.wire.ur.pose import ZERO_POSE, Pose, matrix_to_pose, pose_to_matrix
-from sim_twin.wire.ur.program import Program, Thread
+from sim_twin.wire.ur.program import Program, ScriptError, Thread, checked
+from sim_twin.wire.ur.speed_servo import servo_circular, servo_joints, speed_joints, speed_line
+from sim_twin.wire.ur.stops import stop_joints, stop_line
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -65,7 +68,7 @@ class ControlLoop:
         self._circle_args = (ZERO_POSE, 0.25, 1.2)
         self._jog_args: tuple[Array, float] = (np.zeros(6), 0.5)
         self._gain = 0.5
-        self._commands: dict[int, Callable[[], Motion | None]] = {
+        self._commands: dict[int, Callable[[], Thread | None]] = {
             1: lambda: self._move_to(is_pose=False, straight=False),
             2: self._move_joints_to_pose,
             3: lambda: self._move_to(is_pose=True, straight=True),
@@ -88,7 +91,7 @@ class ControlLoop:
             25: lambda: self._answer(self._controller.contact_steps(self._floats(0, 3))),
             26: lambda: self._answer_floats((PERIOD_S,)),
             27: lambda: self._answer_floats(self._controller.joints_before(self._int(1)).tolist()),
-            28: lambda: self._answer_floats(ur_motion.tcp_pose(self._arm, self._arm.waypoint)),
+            28: lambda: self._answer_floats(self._arm.tcp_pose(self._arm.waypoint)),
             29: lambda: self._controller.set_tcp(self._floats(0, 6)),
             30: lambda: self._inverse(self._six(6)),
             31: lambda: self._controller.protective_stop("the program asked for it"),
@@ -102,7 +105,7 @@ class ControlLoop:
             40: lambda: self._answer_floats(self._arm.tcp),
             41: self._start_jog,
             42: self._stop_jog,
-            43: lambda: self._answer_floats(ur_motion.tcp_pose(self._arm, self._arm.measured_q)),
+            43: lambda: self._answer_floats(self._arm.tcp_pose(self._arm.measured_q)),
             44: self._forward,
             45: self._follow_path,
             46: lambda: self._inverse(self._arm.q),
@@ -147,7 +150,7 @@ class ControlLoop:
                 executing = True
             yield
 
-    def _carry_out(self, command: int) -> Motion:
+    def _carry_out(self, command: int) -> Thread:
         if command in self._commands:
             motion = self._commands[command]()
             if motion is not None:
@@ -191,28 +194,28 @@ class ControlLoop:
 
     # Moves
 
-    def _move_to(self, *, is_pose: bool, straight: bool) -> Motion:
+    def _move_to(self, *, is_pose: bool, straight: bool) -> Thread:
         move = Move(tuple(self._floats(0, 6)), is_pose, straight, self._float(6), self._float(7))
         return self._start_move((move,))
 
-    def _move_joints_to_pose(self) -> Motion:
+    def _move_joints_to_pose(self) -> Thread:
         q = self._arm.inverse(pose_to_matrix(self._floats(0, 6)), self._arm.q)
         return self._start_move((Move(tuple(q.tolist()), False, False, self._float(6), self._float(7)),))
 
-    def _follow_path(self) -> Motion:
+    def _follow_path(self) -> Thread:
         return self._start_move(self._path, report=True)
 
-    def _start_move(self, moves: Sequence[Move], *, report: bool = False) -> Motion:
+    def _start_move(self, moves: Sequence[Move], *, report: bool = False) -> Thread:
         asynchronous = self._int(1) == 1
         self._stop_async_move()
         begin = (lambda number: self._report(running=True, progress=number)) if report else (lambda _: None)
-        motion = ur_motion.follow(self._arm, moves, begin)
+        motion = follow(self._arm, moves, begin)
         if not asynchronous:
             yield from motion
             return
         self._move = self.program.run(self._async_operation(motion))
 
-    def _async_operation(self, motion: Motion) -> Thread:
+    def _async_operation(self, motion: Thread) -> Thread:
         self._report(running=True)
         yield from motion
         self._report(running=False)
@@ -223,7 +226,7 @@ class ControlLoop:
             self._report(running=False)
         self._move = None
 
-    def _stop_command(self) -> Motion:
+    def _stop_command(self) -> Thread:
         deceleration, asynchronous = self._float(0), self._int(1) == 1
         if self.program.alive(self._stop):
             self.program.kill(self._stop)
@@ -232,9 +235,9 @@ class ControlLoop:
             self._stop_async_move()
         if asynchronous:
             self._async_stop_used = True
-            self._stop = self.program.run(self._async_operation(ur_motion.stop_line(self._arm, deceleration)))
+            self._stop = self.program.run(self._async_operation(stop_line(self._arm, deceleration)))
             return
-        stop = ur_motion.stop_line if self._async_stop_used else ur_motion.stop_joints
+        stop = stop_line if self._async_stop_used else stop_joints
         yield from stop(self._arm, deceleration)
 
     # Speed, servo, jog
@@ -247,12 +250,12 @@ class ControlLoop:
     def _speed_thread(self) -> Thread:
         while True:
             line, target, acceleration, time = self._speed_args
-            motion = ur_motion.speed_line if line else ur_motion.speed_joints
+            motion = speed_line if line else speed_joints
             yield from motion(self._arm, target, acceleration, max(time, 0.0))
 
-    def _stop_speed(self) -> Motion:
+    def _stop_speed(self) -> Thread:
         self.program.kill(self._speed)
-        stop = ur_motion.stop_line if self._speed_args[0] else ur_motion.stop_joints
+        stop = stop_line if self._speed_args[0] else stop_joints
         yield from stop(self._arm, self._float(0))
 
     def _servo_command(self, q: Array) -> None:
@@ -263,7 +266,7 @@ class ControlLoop:
 
     def _servo_thread(self) -> Thread:
         while True:
-            yield from ur_motion.servo_joints(self._arm, *self._servo_args)
+            yield from servo_joints(self._arm, *self._servo_args)
 
     def _servo_circular_command(self) -> None:
         pose = self._pose(0)
@@ -273,15 +276,15 @@ class ControlLoop:
 
     def _servo_circular_thread(self) -> Thread:
         while True:
-            yield from ur_motion.servo_circular(self._arm, *self._circle_args)
+            yield from servo_circular(self._arm, *self._circle_args)
 
     def _servoing(self) -> bool:
         return self.program.alive(self._servo) or self.program.alive(self._servo_circular)
 
-    def _stop_servo(self) -> Motion:
+    def _stop_servo(self) -> Thread:
         self.program.kill(self._servo)
         self.program.kill(self._servo_circular)
-        yield from ur_motion.stop_line(self._arm, self._float(0))
+        yield from stop_line(self._arm, self._float(0))
 
     def _start_jog(self) -> None:
         speed, feature, acceleration = self._six(0), int(self._float(6)), self._float(7)
@@ -293,31 +296,31 @@ class ControlLoop:
     def _jog_thread(self) -> Thread:
         while True:
             speed, acceleration = self._jog_args
-            yield from ur_motion.speed_line(self._arm, speed, acceleration, 0.01)
+            yield from speed_line(self._arm, speed, acceleration, 0.01)
 
-    def _stop_jog(self) -> Motion:
+    def _stop_jog(self) -> Thread:
         self.program.kill(self._jog)
-        yield from ur_motion.stop_line(self._arm, 1.2)
+        yield from stop_line(self._arm, 1.2)
 
     def _tool_axes(self) -> Array:
         return self._arm.forward(self._arm.measured_q)
 
     # Contact and force
 
-    def _move_until_contact(self) -> Motion:
+    def _move_until_contact(self) -> Thread:
         speed, direction, acceleration = self._six(0), self._floats(6, 3), self._float(12)
         while True:
             steps = self._controller.contact_steps(direction)
             if steps > 0:
                 yield from self._back_to_contact(steps)
                 return
-            yield from ur_motion.speed_line(self._arm, speed, acceleration, PERIOD_S)
+            yield from speed_line(self._arm, speed, acceleration, PERIOD_S)
 
-    def _back_to_contact(self, steps: int) -> Motion:
+    def _back_to_contact(self, steps: int) -> Thread:
         q = self._controller.joints_before(steps)
-        yield from ur_motion.stop_line(self._arm, _CONTACT_STOP_M_S2)
+        yield from stop_line(self._arm, _CONTACT_STOP_M_S2)
         speed, acceleration = _BACK_TO_CONTACT
-        yield from ur_motion.follow(self._arm, [Move(tuple(q.tolist()), False, True, speed, acceleration)])
+        yield from follow(self._arm, [Move(tuple(q.tolist()), False, True, speed, acceleration)])
 
     def _start_contact_detection(self) -> None:
         self.program.kill(self._contact)
@@ -345,7 +348,7 @@ class ControlLoop:
         self.program.kill(self._contact)
         self._answer(self._contact_steps)
 
-    def _after_contact(self) -> Motion:
+    def _after_contact(self) -> Thread:
         self._stop_async_move()
         yield from self._back_to_contact(self._contact_steps)
 
@@ -371,9 +374,9 @@ class ControlLoop:
                 frame[:3, :3] = np.column_stack([x, np.cross(axes[:, 2], x), axes[:, 2]])
         self._arm.force_mode = ForceMode(frame[:3, :3], selection, self._six(6), self._six(12), self._gain)
 
-    def _stop_force_mode(self) -> Motion:
+    def _stop_force_mode(self) -> Thread:
         self._arm.force_mode = None
-        yield from ur_motion.stop_line(self._arm, 10.0)
+        yield from stop_line(self._arm, 10.0)
 
     def _set_gain(self) -> None:
         self._gain = min(max(self._float(0), 0.0), 2.0)

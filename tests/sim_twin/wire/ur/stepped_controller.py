@@ -6,17 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_twin.wire.shared_state import CELL_STATE
+from sim_twin.wire.shared_state import CELL_STATE, PERIOD_S
 from sim_twin.wire.ur.control_loop import DONE, READY, ControlLoop
 from sim_twin.wire.ur.controller import Controller, RuntimeState
-from sim_twin.wire.ur.motion import PERIOD_S
 from tests.sim_twin.wire.ur.stub_world import START_Q
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from robotcell.geometry.transforms import Array
-    from sim_twin.wire.ur.motion import Move
+    from sim_twin.wire.ur.moves import Move
 
 
 class Rig:

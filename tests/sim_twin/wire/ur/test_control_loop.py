@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robotcell.geometry import ur5e
 from sim_twin.wire.ur.controller import RuntimeState, SafetyMode
-from sim_twin.wire.ur.motion import Move
+from sim_twin.wire.ur.moves import Move
 from sim_twin.wire.ur.pose import matrix_to_pose, pose_to_matrix
 from sim_twin.wire.ur.snapshot import Snapshot
 from sim_twin.wire.ur.variables import OUTPUTS

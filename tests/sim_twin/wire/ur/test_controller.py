@@ -16,9 +16,8 @@ from sim_twin.wire.faults import Fault, FaultInbox, Kind
 from sim_twin.wire.shared_state import CELL_STATE
 from sim_twin.wire.ur.controller import UNLOCK_AFTER_S, RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.dashboard import DashboardSession
-from sim_twin.wire.ur.motion import ScriptError
 from sim_twin.wire.ur.pose import matrix_to_pose
-from sim_twin.wire.ur.program import Program
+from sim_twin.wire.ur.program import Program, ScriptError
 from sim_twin.wire.ur.script import ScriptReader
 from sim_twin.wire.ur.server import FAULTS
 from sim_twin.wire.ur.snapshot import Snapshot
