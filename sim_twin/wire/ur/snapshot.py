@@ -10,7 +10,7 @@ import math
 from typing import TYPE_CHECKING
 
 from robotcell.geometry import ur5e
-from sim_twin.wire.ur.controller import RobotMode, RuntimeState, SafetyMode
+from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.variables import OUTPUTS, REGISTERS, SINGLE_BITS, Value
 
 if TYPE_CHECKING:

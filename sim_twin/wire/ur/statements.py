@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.controller import Payload
 from sim_twin.wire.ur.moves import follow
 from sim_twin.wire.ur.program import ScriptError
+from sim_twin.wire.ur.registers import Payload
 from sim_twin.wire.ur.script import PoseValue, Statement, Value, argument, move_of, number_of, numbers_of
 from sim_twin.wire.ur.speed_servo import servo_joints, speed_joints, speed_line
 from sim_twin.wire.ur.stops import stop_joints, stop_line
