@@ -15,13 +15,13 @@ import numpy.typing as npt
 from robotcell.errors import CalibrationError
 from robotcell.geometry import rg2
 from robotcell.geometry.ur5e import inverse
-from robotcell.perception.view import look
 from robotcell.motion.executor import Ending, Executor
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, Step
-from robotcell.motion.tool import flange_pose, tool_down
 from robotcell.motion.retreat import plan_retreat
+from robotcell.motion.tool import flange_pose, tool_down
 from robotcell.perception.heightmap import Heightmap, TablePlane, build_heightmap
+from robotcell.perception.view import look
 
 if TYPE_CHECKING:
     from robotcell.cell import Cell

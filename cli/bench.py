@@ -12,11 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import progress, report_error, results
+from cli.options import CellChoice
 from policy.evaluation.benchmark import Settings, by_suite, finished, load, plan, run, start, write_json
 from policy.evaluation.page import write_page
 from policy.evaluation.report import results_table
 from policy.evaluation.suites import SUITES, describe_suite
-from robotcell.config import load_config
 from robotcell.errors import CellError, ConfigError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def run_bench(
     """Run the command; returns the exit code.
 
     Args:
-        given: the options that say what to run and were given: suite, policy, trials, seed, scenes, meshes, cell.
+        given: the options that say what to run and were given: suite, policy, trials, seed, scenes, meshes, cell, set.
         resume: folder of a benchmark to continue, which says what to run.
         json_file: where all metrics and trials go.
         workers: see `policy.rollouts.run_tasks`.
@@ -70,8 +70,8 @@ def run_bench(
 def _settings(given: Mapping[str, Any]) -> Settings:
     if "suite" not in given:
         raise ConfigError(f"say --suite, one or several of {', '.join(SUITES)}, or --resume with a benchmark's folder")
-    cell_file = given.get("cell")
-    cell = load_config(cell_file)
+    cell_file, settings = given.get("cell"), given.get("set", ())
+    cell = CellChoice(cell_file, list(settings)).load()
     return Settings(
         suites=_names(given["suite"]),
         policies=_names(given.get("policy", cell.policy.name)),
@@ -80,6 +80,7 @@ def _settings(given: Mapping[str, Any]) -> Settings:
         scenes=_path(given.get("scenes")),
         meshes=_path(given.get("meshes")),
         cell_file=_path(cell_file),
+        settings=settings,
         cell=cell,
     )
 
@@ -99,6 +100,7 @@ def _settings_of(folder: Path, given: Mapping[str, Any]) -> Settings:
         "scenes": settings.scenes,
         "meshes": settings.meshes,
         "cell": settings.cell_file,
+        "set": settings.settings or None,
     }
     asked = {key: _path(value) if isinstance(value, Path) else value for key, value in given.items()}
     differing = [key for key, value in asked.items() if value != recorded[key]]

@@ -2,49 +2,46 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from typing import TYPE_CHECKING
 
 import typer
 from rich.table import Table
 from rich.text import Text
 
-from cli.console import progress, report_error, results
+from cli.console import print_json, progress, report_error, results
 from robotcell.cell import open_cell
-from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import examine
 from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import CellError
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from cli.options import CellChoice
 
 _STYLES = {Grade.OK: "green", Grade.NOTE: "yellow", Grade.WRONG: "bold red"}
 _SOMETHING_WRONG = 3
 
 
-def run_doctor(cell_file: Path | None, seconds: float, *, as_json: bool) -> int:
+def run_doctor(choice: CellChoice, seconds: float, *, as_json: bool) -> int:
     """Run the command; returns the exit code: 0 nothing is wrong, 2 configuration, 3 something is wrong."""
     try:
-        config = load_config(cell_file)
+        config = choice.load()
         with progress().status(f"looking at the cell for {seconds:g} s"):
             findings = examine(config, seconds)
     except CellError as error:
-        return report_error(error)
+        return report_error(error, as_json=as_json)
     wrong = any(finding.grade is Grade.WRONG for finding in findings)
     if as_json:
         rows = [{**vars(finding), "grade": finding.grade.value} for finding in findings]
-        sys.stdout.write(json.dumps({"ok": not wrong, "findings": rows}) + "\n")
+        print_json({"ok": not wrong, "findings": rows})
     else:
         _print(findings)
     return _SOMETHING_WRONG if wrong else 0
 
 
-def run_recover(cell_file: Path | None, *, yes: bool) -> int:
+def run_recover(choice: CellChoice, *, yes: bool) -> int:
     """Leave a stop after the operator has looked at the cell; returns the exit code."""
     try:
-        config = load_config(cell_file)
+        config = choice.load()
         cell = open_cell(config)
         question = (
             "Nothing touches the arm, nobody is within its reach, and what it holds may fall or stay: leave the stop?"

@@ -10,18 +10,17 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import report_error, results
-from robotcell.config import load_config
 from robotcell.errors import CellError
 from robotcell.jobs.journal import Job, Journal, Metrics
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from cli.options import CellChoice
 
 
-def list_jobs(cell_file: Path | None, limit: int) -> int:
+def list_jobs(cell: CellChoice, limit: int) -> int:
     """Print the newest jobs; returns the exit code."""
     try:
-        place = load_config(cell_file).journal
+        place = cell.load().journal
         if place.url is None and not place.default_file.exists():
             rows = []
         else:
@@ -50,10 +49,10 @@ def list_jobs(cell_file: Path | None, limit: int) -> int:
     return 0
 
 
-def show_job(cell_file: Path | None, job_id: int) -> int:
+def show_job(cell: CellChoice, job_id: int) -> int:
     """Print one job with its actions and metrics; returns the exit code."""
     try:
-        with Journal(load_config(cell_file).journal.database_url()) as journal:
+        with Journal(cell.load().journal.database_url()) as journal:
             job, metrics = journal.job(job_id), journal.metrics(job_id)
     except CellError as error:
         return report_error(error)

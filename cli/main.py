@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from cli.calibrate import app as calibrate_app
-from cli.options import CellFile, Meshes, Objects, Scene, Seed  # noqa: TC001 - typer reads them
+from cli.options import CellChoice, CellFile, Meshes, Objects, Scene, Seed, Settings, Verbose
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 # Everything heavy is imported inside the commands, so that --help answers at once.
 
 app = typer.Typer(
-    help="Pick objects with a UR5e, an RG2 and a D415, or with their simulated twin.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 jobs_app = typer.Typer(help="What past jobs did.", invoke_without_command=True, pretty_exceptions_enable=False)
@@ -36,6 +34,24 @@ app.add_typer(twin_app, name="twin")
 app.add_typer(calibrate_app, name="calibrate")
 
 
+def _version(value: bool) -> None:
+    if value:
+        from importlib.metadata import version
+
+        typer.echo(f"robotcell {version('robotcell')}")
+        raise typer.Exit
+
+
+@app.callback()
+def robotcell(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    verbose: Verbose = False,
+) -> None:
+    """Pick objects with a UR5e, an RG2 and a D415, or with their simulated twin."""
+
+
 @app.command()
 def pick(
     goal: Annotated[
@@ -43,6 +59,7 @@ def pick(
     ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Pick everything on the table.")] = False,
     cell: CellFile = None,
+    settings: Settings = None,
     scene: Scene = None,
     meshes: Meshes = None,
     objects: Objects = None,
@@ -54,6 +71,7 @@ def pick(
         bool, typer.Option("--dry-run", help="Look, decide, plan, check and draw one action; move nothing.")
     ] = False,
     json_: Annotated[bool, typer.Option("--json", help="Print one JSON summary and nothing else.")] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Pick one or several goals, or everything.
 
@@ -61,15 +79,8 @@ def pick(
     """
     from cli.pick import run_pick
 
-    overrides = {
-        "backend.options.scene": scene,
-        "backend.options.meshes": meshes,
-        "backend.options.objects": objects,
-        "backend.options.seed": seed,
-        "policy.name": policy,
-    }
-    given = {key: value for key, value in overrides.items() if value is not None}
-    raise typer.Exit(run_pick(goal, all_, cell, given, dry_run=dry_run, as_json=json_))
+    options = {"--scene": scene, "--meshes": meshes, "--objects": objects, "--seed": seed, "--policy": policy}
+    raise typer.Exit(run_pick(goal, all_, CellChoice(cell, settings, options), dry_run=dry_run, as_json=json_))
 
 
 @app.command()
@@ -92,6 +103,7 @@ def train(
     ray: Annotated[
         str | None, typer.Option(help="Address of a Ray cluster that plays the scenes.", show_default=False)
     ] = None,
+    verbose: Verbose = False,
 ) -> None:
     """Train the policy in the twin.
 
@@ -135,6 +147,7 @@ def bench(
         Path | None, typer.Option(help="Folder of the OBJ files that they name.", show_default=False)
     ] = None,
     cell: CellFile = None,
+    settings: Settings = None,
     json_: Annotated[
         Path | None, typer.Option("--json", help="Write all metrics and trials to this file.", show_default=False)
     ] = None,
@@ -147,6 +160,7 @@ def bench(
     resume: Annotated[
         Path | None, typer.Option(help="Continue the benchmark of this folder.", show_default=False)
     ] = None,
+    verbose: Verbose = False,
 ) -> None:
     """Compare policies on suites of scenes in the twin, with the paper's metrics and a page of results.
 
@@ -162,6 +176,7 @@ def bench(
         "scenes": scenes,
         "meshes": meshes,
         "cell": cell,
+        "set": tuple(settings) if settings else None,
     }
     given = {key: value for key, value in options.items() if value is not None}
     raise typer.Exit(run_bench(given, resume, json_, workers, ray))
@@ -170,8 +185,10 @@ def bench(
 @app.command()
 def doctor(
     cell: CellFile = None,
+    settings: Settings = None,
     seconds: Annotated[float, typer.Option(min=0.5, max=60, help="How long latencies are measured.")] = 5.0,
     json_: Annotated[bool, typer.Option("--json", help="Print the findings as JSON and nothing else.")] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Look at every device of a hardware cell, say what is wrong and what to do. Moves nothing.
 
@@ -179,13 +196,15 @@ def doctor(
     """
     from cli.doctor import run_doctor
 
-    raise typer.Exit(run_doctor(cell, seconds, as_json=json_))
+    raise typer.Exit(run_doctor(CellChoice(cell, settings), seconds, as_json=json_))
 
 
 @app.command()
 def recover(
     cell: CellFile = None,
+    settings: Settings = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask: the cell was looked at.")] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Leave a protective stop, or make an arm ready whose program was stopped. Asks first.
 
@@ -193,28 +212,35 @@ def recover(
     """
     from cli.doctor import run_recover
 
-    raise typer.Exit(run_recover(cell, yes=yes))
+    raise typer.Exit(run_recover(CellChoice(cell, settings), yes=yes))
 
 
 @jobs_app.callback()
 def jobs(
     context: typer.Context,
     cell: CellFile = None,
+    settings: Settings = None,
     limit: Annotated[int, typer.Option(min=1, help="How many of the newest jobs.")] = 20,
+    verbose: Verbose = False,
 ) -> None:
     """List the newest jobs."""
     if context.invoked_subcommand is None:
         from cli.history import list_jobs
 
-        raise typer.Exit(list_jobs(cell, limit))
+        raise typer.Exit(list_jobs(CellChoice(cell, settings), limit))
 
 
 @jobs_app.command()
-def show(job: Annotated[int, typer.Argument(help="The job's number.")], cell: CellFile = None) -> None:
+def show(
+    job: Annotated[int, typer.Argument(help="The job's number.")],
+    cell: CellFile = None,
+    settings: Settings = None,
+    verbose: Verbose = False,
+) -> None:
     """Print one job: its actions, what came of them, and its metrics."""
     from cli.history import show_job
 
-    raise typer.Exit(show_job(cell, job))
+    raise typer.Exit(show_job(CellChoice(cell, settings), job))
 
 
 @twin_app.command()
@@ -227,6 +253,7 @@ def serve(
         typer.Option(min=0, max=65535, help="Of the control socket for faults; none unless given.", show_default=False),
     ] = None,
     cell: CellFile = None,
+    settings: Settings = None,
     scene: Scene = None,
     meshes: Meshes = None,
     objects: Objects = None,
@@ -234,6 +261,7 @@ def serve(
     expose: Annotated[
         bool, typer.Option("--expose", help="Listen on an address that other machines can reach.")
     ] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Serve a UR5e, an RG2 and a D415 in real time, for any client that speaks their protocols, until interrupted.
 
@@ -271,10 +299,12 @@ def record(
     out: Annotated[Path, typer.Option(help="The .db3 file to write.")],
     seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long.")] = 3.0,
     cell: CellFile = None,
+    settings: Settings = None,
     scene: Scene = None,
     meshes: Meshes = None,
     objects: Objects = None,
     seed: Seed = None,
+    verbose: Verbose = False,
 ) -> None:
     """Record what the camera sees of a scene, for librealsense to play, or as camera.source of a cell.
 

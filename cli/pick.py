@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
@@ -11,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 from rich.table import Table
 from rich.text import Text
 
-from cli.console import progress, report_error, results
+from cli.console import error_as_json, print_json, progress, report_error, results
 from policy import make_policy
 from robotcell.cell import open_cell
-from robotcell.config import CellConfig, load_config
 from robotcell.errors import CellError, ConfigError, NoTarget
 from robotcell.io.images import write_image
 from robotcell.jobs.job import Report, preview, run_job
@@ -26,22 +23,23 @@ from robotcell.motion.grasp import Grasp
 from robotcell.perception.goals import goal_color
 
 if TYPE_CHECKING:
-    from robotcell.jobs.verdict import Outcome
-    from robotcell.jobs.decision import Decision
-    from robotcell.perception.view import View
     from pathlib import Path
 
     from rich.console import Console
     from rich.status import Status
 
+    from cli.options import CellChoice
+    from robotcell.config import CellConfig
+    from robotcell.jobs.decision import Decision
+    from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
+    from robotcell.perception.view import View
 
 
 def run_pick(
     goal: str | None,
     everything: bool,
-    cell_file: Path | None,
-    overrides: dict[str, Any],
+    cell: CellChoice,
     *,
     dry_run: bool,
     as_json: bool,
@@ -51,7 +49,7 @@ def run_pick(
     report, error = None, None
     try:
         goals = _goals(goal, everything)
-        config = load_config(cell_file, overrides)
+        config = cell.load()
         check_config(config)
         if dry_run:
             return _dry_run(goals, config, as_json=as_json)
@@ -61,9 +59,9 @@ def run_pick(
     if error is None and report is not None and not report.completed:
         # What is asked for is not there, or was given up.
         error = NoTarget(report.reason)
-    summary = _summary(report, str(error) if error else "", time.perf_counter() - started)
+    summary = _summary(report, error, time.perf_counter() - started)
     if as_json:
-        _print_json(summary)
+        print_json(summary)
     elif report is not None:
         _print_summary(summary, results())
     return report_error(error) if error else 0
@@ -115,7 +113,7 @@ def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, *, as_json: bool
     steps = [step.label for step in checked.plan.steps]
     if as_json:
         action = decision.action
-        _print_json(
+        print_json(
             {
                 "dry_run": True,
                 **_as_json(action),
@@ -175,12 +173,13 @@ class _Progress:
         )
 
 
-def _summary(report: Report | None, reason: str, wall_s: float) -> dict[str, Any]:
+def _summary(report: Report | None, error: CellError | None, wall_s: float) -> dict[str, Any]:
     """What came of the command; zeros where no job was started."""
     metrics = report.metrics if report else None
     return {
         "completed": report.completed if report else False,
-        "reason": reason,
+        "reason": str(error) if error else "",
+        **error_as_json(error),
         "picked": metrics.grasp_successes if metrics else 0,
         "picked_objects": list(metrics.picked) if metrics else [],
         "actions": metrics.actions if metrics else 0,
@@ -194,14 +193,10 @@ def _summary(report: Report | None, reason: str, wall_s: float) -> dict[str, Any
     }
 
 
-def _print_json(summary: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(summary) + "\n")
-
-
 def _print_summary(summary: dict[str, Any], out: Console) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in summary.items():
-        if value != "":
+        if value not in {"", None}:
             shown = ", ".join(value) if isinstance(value, list) else str(value)
             table.add_row(Text(key.replace("_", " "), style="bold"), Text(shown, overflow="fold"))
     out.print(table)

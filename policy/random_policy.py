@@ -12,8 +12,8 @@ from policy.barred import repeats
 from policy.grasp_room import DIRECTIONS
 from policy.shadows import cell_centers, estimate_surface
 from robotcell.errors import NoTarget
-from robotcell.motion.rotations import ROTATIONS
 from robotcell.jobs.policy_api import Action, Primitive
+from robotcell.motion.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig

@@ -21,14 +21,14 @@ from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform, transform_points
 from robotcell.motion.path_check import check_path
-from robotcell.motion.tool import TALLEST_OBJECT_M
 from robotcell.motion.plan import JointMove, MotionPlan
+from robotcell.motion.tool import TALLEST_OBJECT_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.calibration_file import CharucoBoard
     from robotcell.config import CellConfig
+    from robotcell.config.calibration_file import CharucoBoard
     from robotcell.interfaces import Intrinsics
     from robotcell.motion.path_check import CheckedPlan
 

@@ -18,11 +18,11 @@ from policy import make_policy
 from robotcell.config import BackendChoice, JournalPlace
 from robotcell.errors import CellError
 from robotcell.jobs.job import Decision, run_job
-from robotcell.jobs.verdict import Outcome, Result
-from robotcell.perception.view import View
 from robotcell.jobs.journal import Journal
 from robotcell.jobs.pictures import describe, draw_decision, draw_view
+from robotcell.jobs.verdict import Outcome, Result
 from robotcell.perception.colors import PALETTE
+from robotcell.perception.view import View
 from sim_twin.devices.backend import open_twin
 
 if TYPE_CHECKING:

@@ -26,10 +26,10 @@ from policy.training.scenes import training_scene
 from robotcell.config import CameraMount, CellConfig
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import look_at, make_transform
-from robotcell.motion.rotations import ROTATIONS
 from robotcell.motion.grasp import grasp_height
-from robotcell.motion.tool import near_height
 from robotcell.motion.push import push_height
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.tool import near_height
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 from robotcell.perception.segmentation import MIN_OBJECT_M
 from sim_twin.d415.noise import NoiseOptions

@@ -1,7 +1,7 @@
 """`cell.toml` and the calibration file: what a cell is, read and checked."""
 
 from robotcell.config.backends import Backend, find_backend
-from robotcell.config.cell_file import load_config, read_toml, wrong_values
+from robotcell.config.cell_file import load_config, parse_setting, read_toml, wrong_values
 from robotcell.config.schema import (
     BackendChoice,
     Bin,
@@ -27,6 +27,7 @@ __all__ = [
     "Workspace",
     "find_backend",
     "load_config",
+    "parse_setting",
     "read_toml",
     "wrong_values",
 ]

@@ -15,7 +15,7 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from robotcell.errors import CalibrationError, ConfigError
 from robotcell.geometry.transforms import Array, check_transform
-from robotcell.io.atomic_file import write_whole
+from robotcell.io.atomic_file import make_folder, write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -313,11 +313,7 @@ def save_calibration(calibration: CameraCalibration, path: Path) -> None:
     """Write a calibration file, as a whole or not at all. What stands there is replaced.
 
     Raises:
-        ConfigError: it cannot be written.
+        StorageError: it cannot be written.
     """
-    text = calibration.model_dump_json(indent=1, exclude_none=True) + "\n"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, text)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    make_folder(path.parent)
+    write_whole(path, calibration.model_dump_json(indent=1, exclude_none=True) + "\n")

@@ -23,12 +23,17 @@ if TYPE_CHECKING:
 _DOCS = "docs/configuration.md"
 
 
-def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> CellConfig:
+def load_config(
+    path: Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    said_as: Mapping[str, str] | None = None,
+) -> CellConfig:
     """Read and check a cell file.
 
     Args:
         path: a TOML file; None for the twin with its defaults.
         overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
+        said_as: how the user gave an override (`--seed`), by dotted key, for the words of errors.
 
     Raises:
         ConfigError: naming every bad key at once, each with its value and what is allowed.
@@ -55,8 +60,26 @@ def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = 
             problems += wrong_values(error, _DOCS, ("backend", "options"))
     if config is None or problems:
         place = str(path) if path else "the cell's settings"
+        for key, words in (said_as or {}).items():
+            problems = [words + line.removeprefix(key) if line.startswith(f"{key} ") else line for line in problems]
         raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
     return config
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Key and value of `table.key=value`; the value as TOML has it, or else as a string.
+
+    Raises:
+        ConfigError: there is no key or no value.
+    """
+    key, equals, value = text.partition("=")
+    key = key.strip()
+    if not equals or not all(part.isidentifier() for part in key.split(".")):
+        raise ConfigError(f"--set {text}: say KEY=VALUE, such as limits.force_n=80; see {_DOCS}")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value.strip()
 
 
 def read_toml(path: Path, example: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 
 from robotcell.errors import StorageError
+from robotcell.io.atomic_file import make_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -30,8 +31,8 @@ def write_image(path: Path, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16
     written, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, compression])
     if not written:
         raise StorageError(f"{path}: an image of shape {image.shape} cannot be written as PNG")
+    make_folder(path.parent)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise StorageError(f"{path} cannot be written: {error.strerror}; check the folder and the disk") from error

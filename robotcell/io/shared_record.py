@@ -14,7 +14,7 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from mmap import mmap
 
-    from robotcell.geometry.transforms import Array
+    from robotcell.interfaces import Array
 
 _NUMBER_BYTES = 8
 

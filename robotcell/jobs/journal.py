@@ -59,26 +59,27 @@ class Journal:
     """
 
     def __init__(self, url: str) -> None:
+        shown = url
         try:
             parsed = make_url(url)
+            # A URL may hold a password.
             shown = parsed.render_as_string(hide_password=True)
-            is_sqlite = parsed.get_backend_name() == "sqlite"
             self._engine = create_engine(parsed)
         except (ArgumentError, ImportError, SQLAlchemyError) as error:
-            raise ConfigError(f"journal.url = {url!r}: the journal cannot be opened: {_cause(error)}") from error
+            raise ConfigError(f"journal.url = {shown!r}: the journal cannot be opened: {_cause(error)}") from error
         try:
-            if is_sqlite and parsed.database not in {None, "", ":memory:"}:
-                Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
-            if is_sqlite:
+            if parsed.get_backend_name() == "sqlite":
+                if parsed.database not in {None, "", ":memory:"}:
+                    Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
                 event.listen(self._engine, "connect", _use_write_ahead_log)
             bring_up_to_date(self._engine)
-        except (OSError, SQLAlchemyError) as error:
+        except BaseException as error:
             self._engine.dispose()
-            raise StorageError(
-                f"journal.url = {shown!r}: the journal cannot be opened: {_cause(error)}; check folder and database"
-            ) from error
-        except ConfigError:
-            self._engine.dispose()
+            where = f"journal.url = {shown!r}: the journal cannot be opened:"
+            if isinstance(error, ConfigError):
+                raise ConfigError(f"{where} {error}") from None
+            if isinstance(error, OSError | SQLAlchemyError):
+                raise StorageError(f"{where} {_cause(error)}; check folder and database") from error
             raise
 
     def __enter__(self) -> Self:

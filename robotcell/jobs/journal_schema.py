@@ -16,7 +16,7 @@ from robotcell.errors import ConfigError
 from robotcell.jobs.journal_tables import SCHEMA_REVISION, Base
 
 if TYPE_CHECKING:
-    from sqlalchemy import Engine
+    from sqlalchemy import Connection, Engine
 
 # The revision of journals that were written before revisions were noted.
 _FIRST_REVISION = "0001"
@@ -42,25 +42,23 @@ def bring_up_to_date(engine: Engine) -> None:
 
 def _bring_up_to_date(engine: Engine) -> None:
     tables = set(inspect(engine).get_table_names())
-    if not tables:
-        Base.metadata.create_all(engine)
-        _note_revision(engine, SCHEMA_REVISION)
-        return
-    if not {"jobs", "actions"} <= tables:
-        raise ConfigError(
-            "journal.url: the database holds tables of another program and no journal; choose another database"
-        )
     revision = _revision(engine) if "alembic_version" in tables else None
-    if revision is None:
-        _note_revision(engine, _FIRST_REVISION)
+    if revision is None and tables - {"alembic_version"}:
+        if not {"jobs", "actions"} <= tables:
+            raise ConfigError("its tables are those of another program; choose another database")
         revision = _FIRST_REVISION
-    if revision > SCHEMA_REVISION:
+        _note_revision(engine, revision)
+    if revision is not None and revision > SCHEMA_REVISION:
         raise ConfigError(
-            f"journal.url: the journal is of schema {revision} and this program knows {SCHEMA_REVISION}; update "
-            "robotcell, or choose another database"
+            f"it is of schema {revision} and this program knows {SCHEMA_REVISION}; update robotcell, or choose another "
+            "database"
         )
-    if revision != SCHEMA_REVISION:
-        _migrate(engine)
+    if revision is None:
+        # Before the tables: another process that opens the database now must not take them for old ones.
+        _note_revision(engine, SCHEMA_REVISION)
+    elif revision != SCHEMA_REVISION:
+        _migrate(engine, revision)
+    Base.metadata.create_all(engine)
 
 
 def _revision(engine: Engine) -> str | None:
@@ -81,12 +79,30 @@ def _note_revision(engine: Engine, revision: str) -> None:
         connection.execute(text("INSERT INTO alembic_version (version_num) VALUES (:revision)"), {"revision": revision})
 
 
-def _migrate(engine: Engine) -> None:
+def _migrate(engine: Engine, revision: str) -> None:
     from alembic import command
     from alembic.config import Config
 
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
     with engine.connect() as connection:
+        if engine.dialect.name == "sqlite":
+            _keep_copy(connection, revision)
+            # A table is changed by writing it anew, and its rows are pointed to meanwhile.
+            connection.exec_driver_sql("PRAGMA foreign_keys=OFF")
+            connection.commit()
         config.attributes["connection"] = connection
         command.upgrade(config, SCHEMA_REVISION)
+        # Connections are used again, and this one must not go without its foreign keys.
+        connection.detach()
+
+
+def _keep_copy(connection: Connection, revision: str) -> None:
+    """Leave the old journal beside the new one, as `journal-0001.db`: a migration that is cut off loses nothing."""
+    database = connection.engine.url.database
+    if database in {None, "", ":memory:"}:
+        return
+    path = Path(str(database))
+    copy = path.with_name(f"{path.stem}-{revision}{path.suffix}")
+    if not copy.exists():
+        connection.exec_driver_sql("VACUUM INTO ?", (str(copy),))

@@ -27,11 +27,11 @@ from policy.push.value import Prospects
 from policy.training.environment import PushGraspEnv
 from robotcell.cell import open_cell
 from robotcell.config import load_config
-from robotcell.perception.view import look
 from robotcell.motion.rotations import ROTATIONS
-from robotcell.perception.heightmap import Heightmap
 from robotcell.perception.goals import find_goal
+from robotcell.perception.heightmap import Heightmap
 from robotcell.perception.segmentation import segment
+from robotcell.perception.view import look
 from sim_twin.scenes.catalog import scene_names
 
 KINDS = ("enclosed", "packed")

@@ -27,8 +27,8 @@ from policy.training.environment import Outcome, PushGraspEnv
 from policy.training.learner import auc
 from robotcell.config import load_config
 from robotcell.errors import NoTarget
-from robotcell.motion.rotations import ROTATIONS
 from robotcell.jobs.policy_api import Observation
+from robotcell.motion.rotations import ROTATIONS
 
 KINDS = ("enclosed", "packed")
 SCENES = 30

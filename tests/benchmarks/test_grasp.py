@@ -10,11 +10,11 @@ import pytest
 from policy import make_policy
 from robotcell.cell import Cell, open_cell
 from robotcell.config import load_config
-from robotcell.perception.view import View, look
 from robotcell.jobs.policy_api import Action, Observation, Primitive
 from robotcell.motion.executor import Executor
 from robotcell.motion.path_check import CheckedPlan, check_path
 from robotcell.motion.plan import plan_action
+from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

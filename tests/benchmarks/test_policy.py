@@ -28,8 +28,8 @@ from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import Observation, Primitive
-from robotcell.perception.heightmap import build_heightmap, close_gaps
 from robotcell.perception.goals import find_goal
+from robotcell.perception.heightmap import build_heightmap, close_gaps
 from robotcell.perception.segmentation import segment
 
 OBJECTS = 30

@@ -12,8 +12,8 @@ from policy.shadows import estimate_surface
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.jobs.policy_api import Observation
-from robotcell.perception.heightmap import build_heightmap
 from robotcell.perception.goals import find_goal
+from robotcell.perception.heightmap import build_heightmap
 from robotcell.perception.segmentation import segment
 
 OBJECTS = 30

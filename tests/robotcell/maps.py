@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.config import Workspace
+from robotcell.config import CellConfig, Workspace
+from robotcell.motion.actions import Action
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import push_in_workspace
 from robotcell.motion.rotations import ROTATIONS
-from robotcell.jobs.policy_api import Action, Primitive
 from robotcell.perception.heightmap import Heightmap, TablePlane
 
 if TYPE_CHECKING:
@@ -31,8 +33,12 @@ def heightmap(height_m: npt.NDArray[np.float32] | None = None, workspace: Worksp
     )
 
 
-def action(primitive: Primitive, x: float, y: float, z: float, rotation: int) -> Action:
-    """An action at a point of the default workspace."""
+KINDS = ("grasp", "push")
+
+
+def action(kind: str, x: float, y: float, height_m: float, rotation: int) -> Action:
+    """A grasp or a push at a point of the default workspace, of a surface that high above the table."""
     assert 0 <= rotation < ROTATIONS
-    row, col = Workspace().cell(x, y)
-    return Action(primitive, row, col, rotation, (x, y, z), 0.5)
+    if kind == "grasp":
+        return Grasp(x, y, height_m, rotation, 0.5)
+    return push_in_workspace((x, y), rotation, CellConfig().motion.push_m, height_m, 0.5, Workspace())

@@ -8,6 +8,7 @@ import pytest
 from robotcell.cell import Cell
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
+from robotcell.interfaces import Devices
 
 
 @dataclass
@@ -28,7 +29,7 @@ class Device:
 
 def cell_of(*devices: Device) -> Cell:
     arm, gripper, camera = (cast("Any", device) for device in devices)
-    return Cell(CellConfig(), arm, gripper, camera, cast("Any", None))
+    return Cell(CellConfig(), Devices(arm, gripper, camera, cast("Any", None)))
 
 
 def test_every_device_is_connected_and_closed() -> None:

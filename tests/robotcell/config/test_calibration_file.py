@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robotcell.config import CameraMount, load_config
 from robotcell.config.calibration_file import (
     CameraCalibration,
     CharucoBoard,
@@ -18,8 +19,7 @@ from robotcell.config.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from robotcell.config import CameraMount, load_config
-from robotcell.errors import CalibrationError, ConfigError
+from robotcell.errors import CalibrationError, ConfigError, StorageError
 from robotcell.geometry.transforms import look_at, make_transform
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def test_a_failed_save_leaves_the_old_file(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(ConfigError, match="cannot be written: No space left"):
+    with pytest.raises(StorageError, match="cannot be written: No space left"):
         save_calibration(calibration, path)
     assert path.read_text() == before
 

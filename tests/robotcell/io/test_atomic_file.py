@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from robotcell.errors import StorageError
 from robotcell.io.atomic_file import replaced, write_whole
 
 if TYPE_CHECKING:
@@ -37,5 +38,5 @@ def test_an_error_leaves_what_was(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_is_missing_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(StorageError, match=r"a\.txt cannot be written: No such file"):
         write_whole(tmp_path / "missing" / "a.txt", "x")

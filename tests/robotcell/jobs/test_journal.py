@@ -4,11 +4,12 @@ import math
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from typing import TYPE_CHECKING
 
 import pytest
 
-from robotcell.errors import ConfigError, DeviceFault
+from robotcell.errors import ConfigError, StorageError
 from robotcell.jobs.journal import ActionRow, Frame, Journal, OutcomeRow
 
 if TYPE_CHECKING:
@@ -34,12 +35,10 @@ def start_action(journal: Journal, job_id: int, primitive: str, goal: str | None
             frame_id=frame_id,
             goal=goal,
             primitive=primitive,
-            row=1,
-            col=2,
             rotation=3,
             x=-0.5,
             y=0.0,
-            z=0.05,
+            surface_m=0.05,
             q_value=0.7,
             started_s=1.0,
         )
@@ -110,9 +109,12 @@ def test_an_unknown_job_says_which_exist(tmp_path: Path) -> None:
             journal.job(5)
 
 
-@pytest.mark.parametrize("url", ["nonsense", "sqlite:////proc/no/journal.db", "spanner://x/y"])
-def test_a_journal_that_cannot_be_opened_says_so(url: str) -> None:
-    with pytest.raises(ConfigError, match=r"journal\.url = .*cannot be opened"):
+@pytest.mark.parametrize(
+    ("url", "error"),
+    [("nonsense", ConfigError), ("sqlite:////proc/no/journal.db", StorageError), ("spanner://x/y", ConfigError)],
+)
+def test_a_journal_that_cannot_be_opened_says_so(url: str, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r"journal\.url = .*cannot be opened"):
         Journal(url)
 
 
@@ -122,15 +124,64 @@ def test_a_password_is_not_shown() -> None:
     assert "secret" not in str(caught.value)
 
 
-def test_a_foreign_database_is_an_error_of_the_setting(tmp_path: Path) -> None:
-    connection = sqlite3.connect(tmp_path / "other.db")
-    connection.execute("CREATE TABLE jobs (id INTEGER PRIMARY KEY, title TEXT)")
-    connection.close()
-    with Journal(f"sqlite:///{tmp_path}/other.db") as journal:
-        with pytest.raises(ConfigError, match="cannot be read"):
-            journal.jobs()
-        with pytest.raises(DeviceFault, match="cannot be written"):
-            journal.start_job(None, "heuristic", {}, tmp_path)
+def test_the_database_of_another_program_is_refused_and_left_alone(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "other.db")) as connection:
+        connection.execute("CREATE TABLE songs (id INTEGER PRIMARY KEY, title TEXT)")
+    with pytest.raises(ConfigError, match="tables are those of another program"):
+        Journal(f"sqlite:///{tmp_path}/other.db")
+    with closing(sqlite3.connect(tmp_path / "other.db")) as connection:
+        assert connection.execute("SELECT name FROM sqlite_master").fetchall() == [("songs",)]
+
+
+def test_a_journal_of_a_newer_program_is_refused(tmp_path: Path) -> None:
+    Journal(f"sqlite:///{tmp_path}/journal.db").close()
+    with closing(sqlite3.connect(tmp_path / "journal.db")) as connection:
+        connection.execute("UPDATE alembic_version SET version_num = '9999'")
+        connection.commit()
+    with pytest.raises(ConfigError, match="schema 9999 and this program knows"):
+        Journal(f"sqlite:///{tmp_path}/journal.db")
+
+
+# As the first journals were made, before revisions were noted.
+FIRST_SCHEMA = """
+CREATE TABLE jobs (id INTEGER NOT NULL, started DATETIME NOT NULL, ended DATETIME, goals JSON, policy VARCHAR NOT NULL,
+    config JSON NOT NULL, run_dir VARCHAR NOT NULL, status VARCHAR NOT NULL, reason VARCHAR NOT NULL, cell_s FLOAT,
+    PRIMARY KEY (id));
+CREATE TABLE frames (id INTEGER NOT NULL, job_id INTEGER NOT NULL, number INTEGER NOT NULL, t FLOAT NOT NULL,
+    color_file VARCHAR NOT NULL, depth_file VARCHAR NOT NULL, coverage FLOAT NOT NULL, tilt_rad FLOAT NOT NULL,
+    offset_m FLOAT NOT NULL, PRIMARY KEY (id), FOREIGN KEY(job_id) REFERENCES jobs (id));
+CREATE TABLE actions (id INTEGER NOT NULL, job_id INTEGER NOT NULL, frame_id INTEGER NOT NULL, goal VARCHAR,
+    primitive VARCHAR NOT NULL, row INTEGER NOT NULL, col INTEGER NOT NULL, rotation INTEGER NOT NULL, x FLOAT NOT NULL,
+    y FLOAT NOT NULL, z FLOAT NOT NULL, q_value FLOAT NOT NULL, started_s FLOAT NOT NULL, PRIMARY KEY (id),
+    FOREIGN KEY(job_id) REFERENCES jobs (id), FOREIGN KEY(frame_id) REFERENCES frames (id));
+CREATE TABLE outcomes (action_id INTEGER NOT NULL, result VARCHAR NOT NULL, success BOOLEAN NOT NULL, picked VARCHAR,
+    detail VARCHAR NOT NULL, peak_force_n FLOAT NOT NULL, ended_s FLOAT NOT NULL, PRIMARY KEY (action_id),
+    FOREIGN KEY(action_id) REFERENCES actions (id));
+INSERT INTO jobs VALUES (1, '2026-01-02 03:04:05', NULL, '["red"]', 'learned', '{"table": {"height_m": 0.02}}', 'runs/a',
+    'complete', '', 8.5);
+INSERT INTO frames VALUES (1, 1, 7, 1.0, 'c.png', 'd.png', 0.9, 0.0, 0.0);
+INSERT INTO actions VALUES (1, 1, 1, 'red', 'push', 3, 4, 5, -0.5, 0.1, 0.07, 0.8, 1.5);
+INSERT INTO outcomes VALUES (1, 'pushed', 1, NULL, 'moved', 12.5, 4.0);
+"""
+
+
+def test_a_journal_of_the_first_schema_is_migrated_with_all_that_it_holds(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "journal.db")) as connection:
+        connection.executescript(FIRST_SCHEMA)
+    for _ in range(2):  # the second time there is nothing to do
+        with Journal(f"sqlite:///{tmp_path}/journal.db") as journal:
+            (action,) = journal.job(1).actions
+            assert action.surface_m == pytest.approx(0.05)
+            assert (action.primitive, action.rotation, action.x, action.end_x) == ("push", 5, -0.5, None)
+            assert action.outcome is not None
+            assert (action.outcome.peak_force_n, action.outcome.grip_force_n) == (12.5, None)
+            assert action.frame.color_file == "c.png"
+            assert journal.metrics(1).pushes == 1
+    with Journal(f"sqlite:///{tmp_path}/journal.db") as journal:
+        start_action(journal, 1, "grasp")
+        assert len(journal.job(1).actions) == 2
+    with closing(sqlite3.connect(tmp_path / "journal-0001.db")) as connection:
+        assert connection.execute("SELECT z FROM actions").fetchall() == [(0.07,)]
 
 
 def test_two_processes_may_open_a_new_journal_at_once(tmp_path: Path) -> None:

@@ -8,22 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotcell.motion.guard import Latch
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError, DeviceFault, GuardTripped, UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.interfaces import ArmMode, ArmState
-from robotcell.jobs.policy_api import Primitive
-from robotcell.motion.guard import Guard
+from robotcell.motion.actions import plan_action
 from robotcell.motion.config_check import check_config
+from robotcell.motion.guard import Guard, Latch
 from robotcell.motion.path_check import check_path
-from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, plan_action
+from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
 from robotcell.motion.retreat import plan_retreat
 from robotcell.motion.tool import tool_down
-from tests.robotcell.maps import action, heightmap
+from tests.robotcell.maps import KINDS, action, heightmap
 
 CONFIG = CellConfig()
 HOME = np.array(CONFIG.motion.home_q)
+TIPS = CONFIG.gripper.tip_clearance_m
 
 
 def plan_of(*steps: Any) -> MotionPlan:
@@ -58,19 +58,17 @@ def state(**changes: Any) -> ArmState:
 
 
 @given(
-    st.sampled_from(Primitive),
+    st.sampled_from(KINDS),
     st.floats(CONFIG.workspace.x[0], CONFIG.workspace.x[1]),
     st.floats(CONFIG.workspace.y[0], CONFIG.workspace.y[1]),
     st.floats(0.0, 0.1),
     st.integers(0, 15),
 )
-def test_every_action_in_the_workspace_has_a_safe_plan(
-    primitive: Primitive, x: float, y: float, z: float, rotation: int
-) -> None:
+def test_every_action_in_the_workspace_has_a_safe_plan(kind: str, x: float, y: float, z: float, rotation: int) -> None:
     try:
-        plan = plan_action(action(primitive, x, y, z, rotation), heightmap(), HOME, CONFIG)
+        plan = plan_action(action(kind, x, y, z, rotation), heightmap(), HOME, CONFIG)
     except UnsafeMotion as error:
-        assert primitive is Primitive.PUSH
+        assert kind == "push"
         assert "inside the workspace" in str(error)
         return
     assert check_path(plan, CONFIG).plan is plan
@@ -81,7 +79,7 @@ def test_every_action_in_the_workspace_has_a_safe_plan(
 @pytest.mark.parametrize("z", [0.0, 0.03, 0.1])
 def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z: float) -> None:
     for rotation in range(16):
-        check_path(plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG), CONFIG)
+        check_path(plan_action(action("grasp", x, y, z, rotation), heightmap(), HOME, CONFIG), CONFIG)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +87,7 @@ def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z
     [
         (joint_move([np.nan] * 6), "not six finite numbers"),
         (joint_move([0.0] * 5), "not six finite numbers"),
-        (joint_move([*HOME[:5], 6.27]), r"joint 5 would turn to 6\.27 rad"),
+        (joint_move([*HOME[:5], 6.27]), r"joint 6 would turn to 6\.27 rad"),
         (joint_move(HOME, speed=2.5), "joint speed 2.5 rad/s"),
         (joint_move(HOME, acceleration=100.0), "joint acceleration 100"),
         (joint_move(HOME, speed=0.0), "joint speed 0 "),
@@ -106,6 +104,31 @@ def test_a_step_outside_the_limits_is_refused(step: Any, reason: str) -> None:
 def test_a_line_below_the_table_is_refused() -> None:
     with pytest.raises(UnsafeMotion, match=r"finger tips would be -?\d"):
         check_path(plan_of(above(-0.5, 0.0, 0.2), to(-0.5, 0.0, 0.001)), CONFIG)
+
+
+def test_tips_may_go_as_low_as_a_plan_means_them_to() -> None:
+    plan = plan_of(above(-0.5, 0.0, 0.2), to(-0.5, 0.0, -0.008))
+    with pytest.raises(UnsafeMotion, match="finger tips"):
+        check_path(plan, CONFIG)
+    checked = check_path(plan, CONFIG, lowest_tip_m=-0.010)
+    low = state(T_base_tcp=tool_down(-0.5, 0.0, -0.008, 0.0))
+    Guard(CONFIG, Latch()).check(low, 0.0, checked.lowest_tip_m)
+    with pytest.raises(GuardTripped, match="left its box"):
+        Guard(CONFIG, Latch()).check(low, 0.0, TIPS)
+
+
+def test_a_checked_plan_carries_the_path_that_was_checked() -> None:
+    plan = plan_of(above(-0.5, 0.0, 0.3), Grip("close", 0.0, 20.0), to(-0.5, 0.1, 0.2))
+    checked = check_path(plan, CONFIG)
+    assert len(checked.joint_paths) == len(plan.steps)
+    start = HOME
+    for step, path in zip(plan.steps, checked.joint_paths, strict=True):
+        np.testing.assert_allclose(path[0], start, atol=1e-9)
+        assert (len(path) == 1) == isinstance(step, Grip)
+        assert np.abs(np.diff(path, axis=0)).max(initial=0) < 0.35
+        start = path[-1]
+    end = ur5e.forward(start) @ rg2.T_FLANGE_TCP
+    np.testing.assert_allclose(end, tool_down(-0.5, 0.1, 0.2, 0.0), atol=1e-6)
 
 
 def test_a_line_out_of_the_box_is_refused() -> None:
@@ -129,7 +152,7 @@ def test_a_line_into_the_bin_wall_is_refused() -> None:
 def test_a_configured_keep_out_is_kept_out_of() -> None:
     shelf = {"name": "shelf", "x": (-0.55, -0.45), "y": (-0.05, 0.05), "z": (0.0, 0.15)}
     config = CellConfig.model_validate({"keep_out": [shelf]})
-    plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
+    plan = plan_action(action("grasp", -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
     with pytest.raises(UnsafeMotion, match="keep-out 'shelf'"):
         check_path(plan, config)
 
@@ -219,9 +242,9 @@ def test_a_violation_latches_until_an_operator_clears_it(
 ) -> None:
     latch = Latch()
     guard = Guard(CONFIG, latch)
-    guard.check(state(), 0.0)
+    guard.check(state(), 0.0, TIPS)
     with pytest.raises(error, match=reason):
-        guard.check(state(**changes), now)
+        guard.check(state(**changes), now, TIPS)
     with pytest.raises(GuardTripped, match="recover"):
         Guard(CONFIG, latch).check_start(state(), 0.0, plan_of())
     latch.clear()
@@ -233,7 +256,7 @@ def test_the_tool_is_judged_by_the_speed_of_its_tip() -> None:
     slow = CellConfig.model_validate({"limits": {"tool_speed_m_s": 0.5}})
     wrist = np.array([0.0, 0.0, 0.0, 0.0, 2.0, 0.0])
     with pytest.raises(GuardTripped, match=r"tool moves at 0\.6"):
-        Guard(slow, Latch()).check(state(qd=wrist), 0.0)
+        Guard(slow, Latch()).check(state(qd=wrist), 0.0, TIPS)
 
 
 def test_a_joint_move_that_would_sweep_the_tool_too_fast_is_refused() -> None:
@@ -265,7 +288,7 @@ def test_a_target_that_is_no_pose_is_refused(T: np.ndarray) -> None:
 )
 def test_no_finger_passes_through_a_small_keep_out(box: dict[str, Any]) -> None:
     config = CellConfig.model_validate({"keep_out": [{"name": "pin", **box}]})
-    plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
+    plan = plan_action(action("grasp", -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
     with pytest.raises(UnsafeMotion, match="keep-out 'pin'"):
         check_path(plan, config)
 
@@ -275,7 +298,7 @@ def test_no_finger_passes_through_a_small_keep_out(box: dict[str, Any]) -> None:
     [
         ({"motion": {"joint_speed_rad_s": 3.0}}, r"motion\.joint_speed_rad_s = 3\.0: above limits"),
         ({"motion": {"linear_speed_m_s": 0.9}, "limits": {"tool_speed_m_s": 0.8}}, r"motion\.linear_speed_m_s"),
-        ({"motion": {"home_q": [100, 0, 0, 0, 0, 0]}}, r"motion\.home_q: joint 0 would turn to 100"),
+        ({"motion": {"home_q": [100, 0, 0, 0, 0, 0]}}, r"motion\.home_q: joint 1 would turn to 100"),
         ({"motion": {"home_q": [-0.8370, -1.4768, 1.9, -1.3733, -1.5708, 0.7338]}}, "between the camera and the"),
         ({"workspace": {"x": (-2.0, -1.6)}}, r"workspace, corner x -2\.0.* leave its limits"),
         (
@@ -296,5 +319,5 @@ def test_a_table_at_another_height_is_as_good(height: float) -> None:
     config = CellConfig.model_validate({"table": {"height_m": height}})
     check_config(config)
     for rotation in (0, 5):
-        plan = plan_action(action(Primitive.GRASP, -0.6, 0.1, height + 0.05, rotation), heightmap(), HOME, config)
+        plan = plan_action(action("grasp", -0.6, 0.1, 0.05, rotation), heightmap(), HOME, config)
         check_path(plan, config)

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from robotcell.config import CellConfig
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
-from robotcell.jobs.policy_api import Primitive
+from robotcell.motion.actions import plan_action
 from robotcell.motion.grasp import LOAD_REACH_M
+from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
 from robotcell.motion.tool import TALLEST_OBJECT_M
-from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, plan_action
-from tests.robotcell.maps import action, heightmap
+from tests.robotcell.maps import KINDS, action, heightmap
 
 CONFIG = CellConfig()
 HOME = np.array(CONFIG.motion.home_q)
@@ -31,7 +31,7 @@ def linear(plan: MotionPlan, label: str) -> LinearMove:
 
 @given(xs, ys, surfaces, rotations)
 def test_a_grasp_closes_below_the_surface_and_above_the_table(x: float, y: float, z: float, rotation: int) -> None:
-    plan = plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG)
+    plan = plan_action(action("grasp", x, y, z, rotation), heightmap(), HOME, CONFIG)
     T = linear(plan, "descend guarded").T_base_tcp
     np.testing.assert_allclose(T[:2, 3], (x, y), atol=1e-6)
     assert T[2, 3] == pytest.approx(max(z - 0.04, CONFIG.gripper.tip_clearance_m), abs=1e-6)
@@ -43,7 +43,7 @@ def test_a_grasp_closes_below_the_surface_and_above_the_table(x: float, y: float
 
 @given(xs, ys, surfaces, rotations)
 def test_a_grasp_lifts_straight_up_until_the_load_clears_the_bin(x: float, y: float, z: float, rotation: int) -> None:
-    plan = plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG)
+    plan = plan_action(action("grasp", x, y, z, rotation), heightmap(), HOME, CONFIG)
     down, up = linear(plan, "descend guarded").T_base_tcp, linear(plan, "lift").T_base_tcp
     np.testing.assert_allclose(up[:2, 3], down[:2, 3], atol=1e-6)
     assert up[2, 3] >= down[2, 3] + CONFIG.motion.approach_m - 1e-6
@@ -54,16 +54,16 @@ def test_the_unguarded_descent_ends_above_what_stands_there() -> None:
     heights = np.zeros(CONFIG.workspace.shape, np.float32)
     x, y = CONFIG.workspace.position(112, 112)
     heights[110:114, 132:136] = 0.08  # a neighbour under one of the open fingers
-    plan = plan_action(action(Primitive.GRASP, x, y, 0.05, 0), heightmap(heights), HOME, CONFIG)
+    plan = plan_action(action("grasp", x, y, 0.05, 0), heightmap(heights), HOME, CONFIG)
     tips = linear(plan, "descend").T_base_tcp[2, 3] + rg2.tip_retraction(CONFIG.gripper.preshape_m)
     assert tips == pytest.approx(0.08 + 0.015, abs=1e-3)
 
 
-@pytest.mark.parametrize("primitive", Primitive)
-def test_what_was_not_seen_may_be_as_tall_as_the_tallest_object(primitive: Primitive) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_was_not_seen_may_be_as_tall_as_the_tallest_object(kind: str) -> None:
     unseen = heightmap(np.full(CONFIG.workspace.shape, np.nan, np.float32))
-    plan = plan_action(action(primitive, -0.5, 0.0, 0.05, 3), unseen, HOME, CONFIG)
-    opening = CONFIG.gripper.preshape_m if primitive is Primitive.GRASP else 0.0
+    plan = plan_action(action(kind, -0.5, 0.0, 0.05, 3), unseen, HOME, CONFIG)
+    opening = CONFIG.gripper.preshape_m if kind == "grasp" else 0.0
     tips = linear(plan, "descend").T_base_tcp[2, 3] + rg2.tip_retraction(opening)
     assert tips >= TALLEST_OBJECT_M
 
@@ -71,7 +71,7 @@ def test_what_was_not_seen_may_be_as_tall_as_the_tallest_object(primitive: Primi
 @given(xs, ys, rotations)
 def test_a_push_goes_straight_and_stays_in_the_workspace(x: float, y: float, rotation: int) -> None:
     try:
-        plan = plan_action(action(Primitive.PUSH, x, y, 0.05, rotation), heightmap(), HOME, CONFIG)
+        plan = plan_action(action("push", x, y, 0.05, rotation), heightmap(), HOME, CONFIG)
     except UnsafeMotion as error:
         assert "inside the workspace" in str(error)
         return
@@ -91,7 +91,7 @@ def test_a_push_goes_straight_and_stays_in_the_workspace(x: float, y: float, rot
 
 @given(xs, ys, rotations)
 def test_what_is_picked_is_let_go_well_inside_the_bin(x: float, y: float, rotation: int) -> None:
-    plan = plan_action(action(Primitive.GRASP, x, y, 0.05, rotation), heightmap(), HOME, CONFIG)
+    plan = plan_action(action("grasp", x, y, 0.05, rotation), heightmap(), HOME, CONFIG)
     (carry,) = (step for step in plan.steps if isinstance(step, JointMove) and step.label == "carry to bin")
     tcp = (ur5e.forward(carry.q) @ rg2.T_FLANGE_TCP)[:3, 3]
     for value, center, side in zip(tcp, CONFIG.bin.center, CONFIG.bin.size, strict=False):
@@ -100,8 +100,8 @@ def test_what_is_picked_is_let_go_well_inside_the_bin(x: float, y: float, rotati
 
 
 def test_every_plan_ends_at_home() -> None:
-    for primitive in Primitive:
-        plan = plan_action(action(primitive, -0.5, 0.0, 0.05, 3), heightmap(), HOME, CONFIG)
+    for kind in KINDS:
+        plan = plan_action(action(kind, -0.5, 0.0, 0.05, 3), heightmap(), HOME, CONFIG)
         last = plan.steps[-1]
         assert isinstance(last, JointMove)
         np.testing.assert_array_equal(last.q, HOME)
@@ -109,11 +109,11 @@ def test_every_plan_ends_at_home() -> None:
 
 def test_a_target_out_of_reach_is_refused() -> None:
     with pytest.raises(UnsafeMotion, match=r"cannot reach x -1\.500"):
-        plan_action(action(Primitive.GRASP, -1.5, 0.0, 0.05, 0), heightmap(), HOME, CONFIG)
+        plan_action(action("grasp", -1.5, 0.0, 0.05, 0), heightmap(), HOME, CONFIG)
 
 
 def test_joint_targets_stay_near_home() -> None:
-    plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, CONFIG)
+    plan = plan_action(action("grasp", -0.5, 0.0, 0.05, 0), heightmap(), HOME, CONFIG)
     for step in plan.steps:
         if isinstance(step, JointMove):
             assert np.abs(step.q - HOME).max() < np.pi

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from robotcell.config import CameraMount, Workspace
 from robotcell.geometry.transforms import look_at, make_transform, rotation_z
 from robotcell.interfaces import Intrinsics, RgbdFrame
+from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.heightmap import BAND_M, build_heightmap
 from tests.robotcell.maps import heightmap
 
@@ -62,7 +63,7 @@ def scenes(draw):
 @given(scenes())
 def test_each_cell_is_its_highest_return(scene):
     workspace, table, T_base_camera, frame, image_mask = scene
-    result = build_heightmap(frame, T_base_camera, workspace, table, {"mask": image_mask})
+    result = build_heightmap(frame, CalibratedCamera(T_base_camera), workspace, table, {"mask": image_mask})
 
     points = points_of(frame, T_base_camera)[frame.depth_m > 0]
     colors, masked = frame.color[frame.depth_m > 0], image_mask[frame.depth_m > 0]
@@ -97,7 +98,7 @@ def test_the_table_is_measured_under_noise_and_objects(offset, slope, covered, s
     depth = depth_of_plane(intrinsics, T_base_camera, offset, slope)
     depth = np.where(np.arange(240)[:, None] < covered * 240, tops, depth)
     depth += rng.normal(0, 0.002, depth.shape)
-    table = build_heightmap(frame_of(depth, intrinsics), T_base_camera, Workspace(), 0.0).table
+    table = build_heightmap(frame_of(depth, intrinsics), CalibratedCamera(T_base_camera), Workspace(), 0.0).table
     assert table is not None
     assert table.offset_m == pytest.approx(offset, abs=4e-4)
     assert table.tilt_rad == pytest.approx(np.arctan(abs(slope)), abs=2e-3)
@@ -108,7 +109,7 @@ def test_a_frame_without_returns_shows_nothing():
     intrinsics = Intrinsics(64, 48, 60, 60, 32, 24)
     depth = np.zeros((48, 64), np.float32)
     depth[0, :3] = np.nan, np.inf, -1.0
-    result = build_heightmap(frame_of(depth, intrinsics), CameraMount().pose(), Workspace(), 0.0)
+    result = build_heightmap(frame_of(depth, intrinsics), CalibratedCamera(CameraMount().pose()), Workspace(), 0.0)
     assert np.isnan(result.height_m).all()
     assert result.coverage == 0
     assert result.table is None
@@ -118,16 +119,18 @@ def test_a_frame_without_returns_shows_nothing():
 def test_what_is_over_the_cap_leaves_the_table_below_unknown():
     intrinsics, T_base_camera = Intrinsics(64, 48, 60, 60, 32, 24), CameraMount().pose()
     depth = depth_of_plane(intrinsics, T_base_camera, BAND_M[1] + 0.05)
-    assert build_heightmap(frame_of(depth, intrinsics), T_base_camera, Workspace(), 0.0).coverage == 0
+    assert build_heightmap(frame_of(depth, intrinsics), CalibratedCamera(T_base_camera), Workspace(), 0.0).coverage == 0
 
 
 def test_images_and_poses_that_do_not_fit_are_refused():
     intrinsics = Intrinsics(64, 48, 60, 60, 32, 24)
     frame = frame_of(np.ones((48, 64)), intrinsics)
     with pytest.raises(ValueError, match=r"image 'goal' is \(64, 48\)"):
-        build_heightmap(frame, CameraMount().pose(), Workspace(), 0.0, {"goal": np.zeros((64, 48), bool)})
+        build_heightmap(
+            frame, CalibratedCamera(CameraMount().pose()), Workspace(), 0.0, {"goal": np.zeros((64, 48), bool)}
+        )
     with pytest.raises(ValueError, match="mirrored"):
-        build_heightmap(frame, np.diag([1.0, 1.0, -1.0, 1.0]), Workspace(), 0.0)
+        CalibratedCamera(np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
 def test_filling_closes_gaps_and_leaves_shadows_at_the_table():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from robotcell.config import Workspace
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.perception.colors import PALETTE
-from robotcell.perception.goals import check_goal_word, find_goal
+from robotcell.perception.goals import find_goal, goal_color
 from robotcell.perception.segmentation import object_mask, segment
 from tests.robotcell.maps import heightmap
 
@@ -136,6 +136,21 @@ def test_the_goal_is_the_most_visible_of_its_colour():
 
 
 def test_an_unknown_goal_word_lists_the_palette():
-    assert check_goal_word("cyan") == "cyan"
-    with pytest.raises(ConfigError, match="'mauve' is not a colour that is known; known are: blue, green, brown"):
-        check_goal_word("mauve")
+    with pytest.raises(ConfigError, match="'mauvish' is not a colour that is known; known are blue, green, brown"):
+        goal_color("mauvish")
+
+
+@pytest.mark.parametrize(
+    ("word", "color"),
+    [
+        ("cyan", "cyan"),
+        ("Red", "red"),
+        ("GREY", "gray"),
+        ("crimson", "red"),
+        ("ForestGreen", "green"),
+        ("gold", "yellow"),
+        ("chocolate", "orange"),
+    ],
+)
+def test_a_goal_is_a_colour_word_in_any_case_and_means_what_an_eye_takes_it_for(word, color):
+    assert goal_color(word) == color

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from calibration.target.board import DEFAULT_BOARD, held_by_gripper
 from calibration.target.detection import Detector
-from robotcell.config.calibration_file import FixedTag
 from robotcell.config import CameraMount, CellConfig
+from robotcell.config.calibration_file import FixedTag
 from robotcell.errors import CalibrationError
 from robotcell.geometry.transforms import invert_transform, make_transform, transform_points
 from robotcell.perception.tags import check_tags, find_tags
