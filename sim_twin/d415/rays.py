@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Intrinsics
-    from sim_twin.world.world import Visual
+    from sim_twin.visual import Visual
 
 Floats = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int32]

@@ -44,7 +44,7 @@ def _decomposed(vertex_bytes: bytes, triangle_bytes: bytes) -> tuple[Mesh, ...]:
     # Faces of one place, where a file gives each its own corners, are neighbours.
     solid = Trimesh(np.frombuffer(vertex_bytes).reshape(-1, 3), np.frombuffer(triangle_bytes, np.int32).reshape(-1, 3))
     # CoACD cuts along the axes.
-    R = oriented_bounds(solid)[0][:3, :3]
+    R = oriented_bounds(solid)[0][:3, :3]  # type: ignore[no-untyped-call]
     coacd.set_log_level("error")
     pieces = coacd.run_coacd(coacd.Mesh(solid.vertices @ R.T, solid.faces), threshold=_THRESHOLD, **_SEARCH)
     return tuple(hull(vertices @ R) for vertices, _ in pieces)

@@ -82,7 +82,9 @@ def _read(path: Path) -> list[Trimesh]:
     with _quiet(path):
         import trimesh
 
-        options = {"split_objects": True, "group_material": False, "skip_materials": True} if kind == ".obj" else {}
+        options: dict[str, Any] = (
+            {"split_objects": True, "group_material": False, "skip_materials": True} if kind == ".obj" else {}
+        )
         data = data.removeprefix(b"\xef\xbb\xbf")
         scene: Any = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, **options)
         if scene.units is not None:
