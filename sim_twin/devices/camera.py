@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import Camera, RgbdFrame
 from sim_twin.d415.noise import WARM_UP_FRAMES
-from sim_twin.d415.rays import Indices, load_open3d
+from sim_twin.d415.open3d_core import load_open3d
 from sim_twin.d415.renderer import FRAMES_PER_S, SERIAL, Floats, Renderer
 from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
     from robotcell.config.schema import CameraMount
+    from sim_twin.d415.rays import Indices
     from sim_twin.options import TwinOptions
     from sim_twin.world.world import World
 

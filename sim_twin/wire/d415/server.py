@@ -16,7 +16,7 @@ from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
 from robotcell.errors import CellError, ConfigError
-from sim_twin.d415.rays import load_open3d
+from sim_twin.d415.open3d_core import load_open3d
 from sim_twin.d415.renderer import FRAMES_PER_S, MODES, SERIAL, Renderer, reported_intrinsics
 from sim_twin.options import TwinOptions
 from sim_twin.wire.d415.clients import Client
