@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from manifold3d import triangulate
 
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
@@ -55,6 +54,8 @@ def without_folds(vertices: Array, triangles: Triangles) -> Triangles:
 
 def _cut(vertices: Array, triangles: Triangles, normal: Array) -> Triangles | None:
     """The outline of folded triangles in one plane, cut anew; None where they are no fold but faces of either side."""
+    from manifold3d import triangulate
+
     total = _areas(vertices, triangles).sum(axis=0)
     normal = normal if total @ normal > 0 else -normal
     loops = _outline(triangles)

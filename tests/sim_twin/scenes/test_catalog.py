@@ -7,7 +7,7 @@ from robotcell.config.schema import Workspace, load_config
 from robotcell.errors import ConfigError
 from robotcell.geometry.rg2 import FINGER_BREADTH_M, FINGER_THICKNESS_M
 from robotcell.geometry.transforms import transform_points
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 from robotcell.perception.colors import PALETTE
 from sim_twin.devices.arm import TwinArm
 from sim_twin.devices.gripper import TwinGripper
