@@ -15,15 +15,17 @@ import numpy.typing as npt
 from robotcell.errors import CalibrationError
 from robotcell.geometry import rg2
 from robotcell.geometry.ur5e import inverse
-from robotcell.jobs.job import look
+from robotcell.perception.view import look
 from robotcell.motion.executor import Ending, Executor
-from robotcell.motion.path_check import check_plan
-from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, Step, flange_pose, plan_retreat, tool_down
+from robotcell.motion.path_check import check_path
+from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, Step
+from robotcell.motion.tool import flange_pose, tool_down
+from robotcell.motion.retreat import plan_retreat
 from robotcell.perception.heightmap import Heightmap, TablePlane, build_heightmap
 
 if TYPE_CHECKING:
     from robotcell.cell import Cell
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
 
 # Their mean has a third of the depth noise.
@@ -158,7 +160,7 @@ def go_above(cell: Cell, spot: Array, height_m: float) -> None:
         _joint("go above", high, config),
         LinearMove("hover", low, config.motion.guarded_speed_m_s, config.motion.linear_acceleration_m_s2),
     ]
-    Executor(cell).run(check_plan(MotionPlan("hover", q, tuple(steps)), config))
+    Executor(cell).run(check_path(MotionPlan("hover", q, tuple(steps)), config))
 
 
 def touch_table(cell: Cell, spot: Array) -> Touch:
@@ -177,11 +179,11 @@ def touch_table(cell: Cell, spot: Array) -> Touch:
         _TOUCH_ACCELERATION_M_S2,
         contact_force_n=_TOUCH_FORCE_N,
     )
-    plan = check_plan(MotionPlan("touch", cell.arm.state().q, (down,)), deep.config)
+    plan = check_path(MotionPlan("touch", cell.arm.state().q, (down,)), deep.config)
     execution = Executor(deep).run(plan)
     met = cell.arm.state().T_base_tcp[2, 3]
     up = LinearMove("lift", _tool_at(spot, _TOUCH_FROM_M), _TOUCH_SPEED_M_S * 4, _TOUCH_ACCELERATION_M_S2)
-    Executor(deep).run(check_plan(MotionPlan("lift", cell.arm.state().q, (up,)), deep.config))
+    Executor(deep).run(check_path(MotionPlan("lift", cell.arm.state().q, (up,)), deep.config))
     if execution.ending is not Ending.CONTACT:
         raise CalibrationError(
             f"the arm met nothing down to {1000 * _TOUCH_BELOW_M:.0f} mm below where the camera sees the table at "
@@ -196,7 +198,7 @@ def go_home(cell: Cell) -> None:
     Raises:
         UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as safety layer, guard and devices do.
     """
-    Executor(cell).run(check_plan(plan_retreat(cell.arm.state(), cell.config), cell.config))
+    Executor(cell).run(check_path(plan_retreat(cell.arm.state(), cell.config), cell.config))
 
 
 def _bare(heights: npt.NDArray[np.floating], heightmap: Heightmap) -> npt.NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from policy.evaluation.benchmark import Settings, by_suite, finished, load, plan
 from policy.evaluation.page import write_page
 from policy.evaluation.report import results_table
 from policy.evaluation.suites import SUITES, describe_suite
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import CellError, ConfigError
 
 if TYPE_CHECKING:

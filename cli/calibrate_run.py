@@ -21,13 +21,14 @@ from calibration.target.board import DEFAULT_BOARD, bolted_to_flange, held_by_gr
 from cli.calibrate_solve import print_solution
 from cli.console import progress, report_error, results
 from robotcell.cell import Cell, open_cell
+from robotcell.config import CellConfig, load_config
 from robotcell.config.calibration_file import CharucoBoard, FixedTag
-from robotcell.config.schema import CellConfig, load_config
 from robotcell.errors import CalibrationError, CellError, ConfigError
 from robotcell.geometry.rg2 import MIN_WIDTH_M
 from robotcell.jobs.pictures import save_picture
+from robotcell.motion.config_check import check_config
 from robotcell.motion.executor import Executor
-from robotcell.motion.path_check import check_config, check_plan
+from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, MotionPlan
 from robotcell.perception.tags import check_tags, find_tags
 
@@ -171,7 +172,7 @@ def _get_ready(cell: Cell, held_by: str, *, yes: bool) -> None:
             raise ConfigError("nothing was moved")
     if held_by == "gripper":
         grip = Grip("hold the board", MIN_WIDTH_M, cell.config.gripper.force_n)
-        Executor(cell).run(check_plan(MotionPlan("hold the board", cell.arm.state().q, (grip,)), cell.config))
+        Executor(cell).run(check_path(MotionPlan("hold the board", cell.arm.state().q, (grip,)), cell.config))
 
 
 def _conclude(folder: Path, out: Path, tags: tuple[FixedTag, ...], cell_file: Path | None, err: Console) -> int:

@@ -14,9 +14,9 @@ from rich.text import Text
 from calibration.verify import Touch, Verification, choose_spots, go_above, go_home, touch_table
 from cli.console import progress, report_error, results
 from robotcell.cell import Cell, open_cell
-from robotcell.config.schema import CellConfig, load_config
+from robotcell.config import CellConfig, load_config
 from robotcell.errors import CalibrationError, CellError, ConfigError
-from robotcell.motion.path_check import check_config
+from robotcell.motion.config_check import check_config
 
 if TYPE_CHECKING:
     from pathlib import Path

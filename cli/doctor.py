@@ -12,7 +12,7 @@ from rich.text import Text
 
 from cli.console import progress, report_error, results
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import Finding, Grade, examine
 from robotcell.errors import CellError
 
@@ -51,9 +51,8 @@ def run_recover(cell_file: Path | None, *, yes: bool) -> int:
         if not yes and not typer.confirm(question, err=True):
             progress().print("nothing was changed")
             return _SOMETHING_WRONG
-        cell.gripper.recover()
         with progress().status("leaving the stop"), cell.arm as arm:
-            arm.recover()
+            cell.recover()
             mode = arm.state().mode.value
     except CellError as error:
         return report_error(error)

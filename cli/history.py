@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import report_error, results
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import CellError
 from robotcell.jobs.journal import Job, Journal, Metrics
 
@@ -68,7 +68,7 @@ def show_job(cell_file: Path | None, job_id: int) -> int:
 
 
 def _actions(job: Job) -> Table:
-    headings = ("", "goal", "action", "x, y, z [m]", "angle [deg]", "q", "seconds", "result", "detail")
+    headings = ("", "goal", "action", "x, y, height [m]", "angle [deg]", "q", "seconds", "result", "detail")
     table = Table(*(escape(heading) for heading in headings))
     for index, action in enumerate(job.actions, start=1):
         outcome = action.outcome
@@ -76,7 +76,7 @@ def _actions(job: Job) -> Table:
             str(index),
             action.goal or "any",
             action.primitive,
-            f"{action.x:.3f}, {action.y:.3f}, {action.z:.3f}",
+            f"{action.x:.3f}, {action.y:.3f}, {action.surface_m:.3f}",
             f"{22.5 * action.rotation:.1f}",
             f"{action.q_value:.2f}",
             f"{outcome.ended_s - action.started_s:.1f}" if outcome else "",

@@ -14,19 +14,27 @@ from rich.text import Text
 from cli.console import progress, report_error, results
 from policy import make_policy
 from robotcell.cell import open_cell
-from robotcell.config.schema import CellConfig, load_config
+from robotcell.config import CellConfig, load_config
 from robotcell.errors import CellError, ConfigError, NoTarget
-from robotcell.jobs.job import Decision, Outcome, Report, View, make_run_dir, preview, run_job
+from robotcell.io.images import write_image
+from robotcell.jobs.job import Report, preview, run_job
 from robotcell.jobs.journal import Journal
-from robotcell.jobs.pictures import Album, describe, draw_decision, save_picture
-from robotcell.motion.path_check import check_config
-from robotcell.perception.segmentation import check_goal_word
+from robotcell.jobs.pictures import JobPictures, describe, draw_decision
+from robotcell.jobs.run_folder import make_run_dir
+from robotcell.motion.config_check import check_config
+from robotcell.motion.grasp import Grasp
+from robotcell.perception.goals import goal_color
 
 if TYPE_CHECKING:
+    from robotcell.jobs.verdict import Outcome
+    from robotcell.jobs.decision import Decision
+    from robotcell.perception.view import View
     from pathlib import Path
 
     from rich.console import Console
     from rich.status import Status
+
+    from robotcell.motion.actions import Action
 
 
 def run_pick(
@@ -67,7 +75,10 @@ def _goals(goal: str | None, everything: bool) -> tuple[str, ...] | None:
         raise ConfigError("say either --goal COLOUR (several as red,blue) or --all")
     if goal is None:
         return None
-    return tuple(check_goal_word(word.strip()) for word in goal.split(","))
+    words = tuple(word.strip().lower() for word in goal.split(","))
+    for word in words:
+        goal_color(word)
+    return words
 
 
 def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tuple[Report | None, CellError | None]:
@@ -77,10 +88,10 @@ def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tup
         journal = stack.enter_context(Journal(config.journal.database_url()))
         status = stack.enter_context(err.status(f"opening the cell ({config.backend.name})"))
         cell = stack.enter_context(open_cell(config))
-        album, following = Album(config), _Progress(err, status)
+        pictures, following = JobPictures(config), _Progress(err, status)
         error = None
         try:
-            report = run_job(cell, policy, journal, goals, (album, following))
+            report = run_job(cell, policy, journal, goals, (pictures, following))
         except CellError as stop:
             if following.job is None:
                 raise
@@ -90,7 +101,7 @@ def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tup
                 job_id, run_dir, False, str(stop), journal.metrics(job_id), journal.job(job_id).cell_s or 0.0
             )
         status.update("drawing the summary")
-        album.finish("complete" if report.completed else f"not complete: {report.reason}")
+        pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
         return report, error
 
 
@@ -98,17 +109,16 @@ def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, *, as_json: bool
     goal = goals[0] if goals else None
     policy = make_policy(config.policy.name, config)
     with progress().status("looking, deciding and planning"), open_cell(config) as cell:
-        decision, plan = preview(cell, policy, goal)
+        decision, checked = preview(cell, policy, goal)
     path = make_run_dir(config.journal.runs, "dry-run") / "plan.png"
-    save_picture(draw_decision(decision, config, f"{describe(decision)}: dry run, nothing moved"), path)
-    steps = [step.label for step in plan.steps]
+    write_image(path, draw_decision(decision, config, f"{describe(decision)}: dry run, nothing moved"))
+    steps = [step.label for step in checked.plan.steps]
     if as_json:
         action = decision.action
         _print_json(
             {
                 "dry_run": True,
-                "primitive": action.primitive.value,
-                "xyz": [round(value, 4) for value in action.xyz],
+                **_as_json(action),
                 "theta_rad": round(action.theta, 4),
                 "q_value": round(action.q_value, 4),
                 "steps": steps,
@@ -121,6 +131,15 @@ def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, *, as_json: bool
     out.print(Text(f"steps: {', '.join(steps)}"), soft_wrap=True)
     out.print(Text(f"picture: {path}"), soft_wrap=True)
     return 0
+
+
+def _as_json(action: Action) -> dict[str, Any]:
+    """Where an action begins and ends: x and y in the base frame, heights above the table, all in metres."""
+    if isinstance(action, Grasp):
+        place = {"x": action.x, "y": action.y, "surface_m": action.surface_m}
+        return {"primitive": "grasp", **{key: round(value, 4) for key, value in place.items()}}
+    start, end = ([round(v, 4) for v in at] for at in (action.start, action.end))
+    return {"primitive": "push", "start": start, "end": end, "top_m": round(action.top_m, 4)}
 
 
 class _Progress:

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import progress, report_error, results
-from robotcell.config.schema import CellConfig, load_config
+from robotcell.config import CellConfig, load_config
 from robotcell.errors import CellError, ConfigError, ConnectionLost
 from sim_twin.wire.cell import ServedCell, is_loopback
 

@@ -9,7 +9,7 @@ from robotcell.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.jobs.policy_api import Policy
 
 

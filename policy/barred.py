@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.grasp_room import DIRECTIONS
-from robotcell.jobs.policy_api import ROTATIONS, Action, Primitive
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.jobs.policy_api import Action, Primitive
 
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array

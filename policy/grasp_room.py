@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from robotcell.geometry import rg2
-from robotcell.jobs.policy_api import ROTATIONS
-from robotcell.motion.plan import GRASP_DEPTH_M
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.grasp import GRASP_DEPTH_M
 
 if TYPE_CHECKING:
     from policy.shadows import Surface

@@ -12,10 +12,11 @@ from policy.barred import repeats
 from policy.grasp_room import DIRECTIONS
 from policy.shadows import cell_centers, estimate_surface
 from robotcell.errors import NoTarget
-from robotcell.jobs.policy_api import ROTATIONS, Action, Primitive
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.jobs.policy_api import Action, Primitive
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.jobs.policy_api import Observation
 
 # A push starts this near to its target (paper: its mask for pushes is dilated by 15 cells of 2 mm).

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
     from robotcell.geometry.transforms import Array
     from robotcell.perception.heightmap import Heightmap
 

@@ -1,54 +1,163 @@
-"""A cell: its three devices, its clock and its configuration."""
+"""A cell: its devices, its configuration, and supervised motions for whoever writes Python."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from robotcell.config.schema import CellConfig, find_backend
-from robotcell.errors import ConnectionLost, DeviceFault, GuardTripped
+import numpy as np
+
+from robotcell.config import find_backend
+from robotcell.errors import ConnectionLost, DeviceFault
+from robotcell.motion.executor import Execution, Executor
+from robotcell.motion.guard import Latch
+from robotcell.motion.path_check import check_path
+from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.retreat import plan_retreat
+from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from types import TracebackType
 
-    from robotcell.interfaces import Arm, Camera, Clock, Gripper
+    import numpy.typing as npt
 
-
-class Latch:
-    """Remembers a safety violation until an operator clears it. Every executor of a cell shares it."""
-
-    def __init__(self) -> None:
-        self._violation: str | None = None
-
-    @property
-    def violation(self) -> str | None:
-        """What tripped it, or None."""
-        return self._violation
-
-    def trip(self, what: str) -> None:
-        """Latch a violation; the first one stands."""
-        self._violation = self._violation or what
-
-    def clear(self) -> None:
-        """Forget the violation. Only ever called because an operator asked for it."""
-        self._violation = None
-
-    def check(self) -> None:
-        """Raise GuardTripped if a violation is latched."""
-        if self._violation:
-            raise GuardTripped(f"nothing moves after a safety stop ({self._violation}); look at the cell, then recover")
+    from robotcell.config import CellConfig, Workspace
+    from robotcell.interfaces import Arm, Camera, Clock, Devices, Gripper
+    from robotcell.motion.plan import Step
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The devices behind the interfaces. As a context manager it connects them all and closes them all."""
+    """The devices behind the interfaces. As a context manager it connects them all and closes them all.
+
+    Attributes:
+        config: of the cell.
+        devices: arm, gripper, camera and clock.
+        latch: remembers a safety stop until an operator recovers the cell.
+    """
 
     config: CellConfig
-    arm: Arm
-    gripper: Gripper
-    camera: Camera
-    clock: Clock
+    devices: Devices
     latch: Latch = field(default_factory=Latch)
+
+    @property
+    def arm(self) -> Arm:
+        """The arm itself, unsupervised."""
+        return self.devices.arm
+
+    @property
+    def gripper(self) -> Gripper:
+        """The gripper itself, unsupervised."""
+        return self.devices.gripper
+
+    @property
+    def camera(self) -> Camera:
+        """The camera itself."""
+        return self.devices.camera
+
+    @property
+    def clock(self) -> Clock:
+        """The cell's time."""
+        return self.devices.clock
+
+    @property
+    def executor(self) -> Executor:
+        """What runs checked plans on this cell."""
+        return Executor(self.devices, self.config, self.latch)
+
+    def look(self, workspace: Workspace | None = None) -> View:
+        """Read the camera and see what is on the table; see `robotcell.perception.view.look`.
+
+        Args:
+            workspace: the map to build; that of the cell unless given.
+
+        Raises:
+            ConnectionLost, DeviceFault, CalibrationError: as the camera and the checks of its picture do.
+        """
+        return look(self.devices, self.config, workspace)
+
+    def move(
+        self,
+        *,
+        joints: npt.ArrayLike | None = None,
+        T_base_tcp: npt.ArrayLike | None = None,
+        speed: float | None = None,
+        contact_force_n: float | None = None,
+    ) -> Execution:
+        """Move the arm, checked and supervised, and wait for its end.
+
+        Give `joints` for a joint-space motion or `T_base_tcp` for a straight one.
+
+        Args:
+            joints: joint angles (6,) [rad].
+            T_base_tcp: pose (4, 4) of the tcp.
+            speed: of the leading joint [rad/s] or of the tcp [m/s]; that of the cell's file unless given.
+            contact_force_n: ends a straight motion at that force [N], with `Ending.CONTACT`.
+
+        Raises:
+            ValueError: neither or both targets are given, or a force with joints.
+            UnsafeMotion: the motion is not safe; nothing moved.
+            GuardTripped, DeviceFault, ConnectionLost: it was stopped; recover the cell before the next one.
+        """
+        motion = self.config.motion
+        step: Step
+        if joints is not None and T_base_tcp is None and contact_force_n is None:
+            q = np.asarray(joints, np.float64)
+            step = JointMove("move", q, speed or motion.joint_speed_rad_s, motion.joint_acceleration_rad_s2)
+        elif T_base_tcp is not None and joints is None:
+            usual = motion.linear_speed_m_s if contact_force_n is None else motion.guarded_speed_m_s
+            target, acceleration = np.asarray(T_base_tcp, np.float64), motion.linear_acceleration_m_s2
+            step = LinearMove("move", target, speed or usual, acceleration, contact_force_n)
+        else:
+            raise ValueError("move needs either joints, or T_base_tcp with or without contact_force_n")
+        return self.run([step], "move")
+
+    def grip(self, width_m: float, force_n: float | None = None) -> Execution:
+        """Move the fingers, supervised, and wait for their end.
+
+        Args:
+            width_m: distance between the finger tips.
+            force_n: at most; that of the cell's file unless given.
+
+        Raises:
+            UnsafeMotion: width or force are outside the gripper's range; nothing moved.
+            GuardTripped, DeviceFault, ConnectionLost: it was stopped; recover the cell before the next motion.
+        """
+        return self.run([Grip("grip", width_m, force_n or self.config.gripper.force_n)], "grip")
+
+    def home(self) -> Execution:
+        """Straight up, open the fingers, and to the home pose, supervised.
+
+        Raises:
+            UnsafeMotion: the way is not safe; nothing moved.
+            GuardTripped, DeviceFault, ConnectionLost: it was stopped; recover the cell before the next motion.
+        """
+        return self.executor.run(check_path(plan_retreat(self.arm.state(), self.config), self.config))
+
+    def run(self, steps: Sequence[Step], label: str) -> Execution:
+        """Check steps as one plan from where the arm stands, run it supervised, and wait for its end.
+
+        Args:
+            steps: of the plan.
+            label: what the plan is called in errors.
+
+        Raises:
+            UnsafeMotion: a step is not safe; nothing moved.
+            GuardTripped, DeviceFault, ConnectionLost: it was stopped; recover the cell before the next motion.
+        """
+        plan = MotionPlan(label, self.arm.state().q, tuple(steps))
+        return self.executor.run(check_path(plan, self.config))
+
+    def recover(self) -> None:
+        """Leave a stop of gripper and arm, because an operator asked for it. The arm must be connected.
+
+        Raises:
+            ConnectionLost, DeviceFault: a device cannot leave its stop; the message says what to do there.
+        """
+        self.gripper.recover()
+        self.arm.recover()
+        self.latch.clear()
 
     def __enter__(self) -> Cell:
         """Connect every device, so that one attempt shows everything that is wrong.
@@ -94,4 +203,4 @@ def open_cell(config: CellConfig) -> Cell:
     Raises:
         ConfigError: its backend is not installed.
     """
-    return find_backend(config.backend.name).open(config)
+    return Cell(config, find_backend(config.backend.name).open(config))

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
     from types import TracebackType
 
-    import numpy as np
-    import numpy.typing as npt
     from typing_extensions import Self
 
-    from robotcell.geometry.transforms import Array
+Array: TypeAlias = npt.NDArray[np.float64]
 
 
 class ArmMode(enum.Enum):
@@ -222,3 +223,13 @@ class Camera(Device, Protocol):
             DeviceFault: the device delivers stale or unusable frames.
         """
         ...
+
+
+@dataclass(frozen=True)
+class Devices:
+    """What a backend opens: the devices of one cell and its clock, not yet connected."""
+
+    arm: Arm
+    gripper: Gripper
+    camera: Camera
+    clock: Clock

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from robotcell.geometry.transforms import make_transform, rotvec_to_matrix
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.geometry.transforms import Array
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calibration.target.detection import Detection, average, draw
 from robotcell.errors import DeviceFault
 from robotcell.geometry.transforms import make_transform
-from robotcell.motion.plan import flange_pose
+from robotcell.motion.tool import flange_pose
 
 if TYPE_CHECKING:
     from calibration.target.detection import Detector

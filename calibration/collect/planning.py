@@ -20,14 +20,15 @@ from calibration.target.board import plate_corners, size_m
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform, transform_points
-from robotcell.motion.path_check import check_plan
-from robotcell.motion.plan import TALLEST_OBJECT_M, JointMove, MotionPlan
+from robotcell.motion.path_check import check_path
+from robotcell.motion.tool import TALLEST_OBJECT_M
+from robotcell.motion.plan import JointMove, MotionPlan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from robotcell.config.calibration_file import CharucoBoard
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.interfaces import Intrinsics
     from robotcell.motion.path_check import CheckedPlan
 
@@ -159,7 +160,7 @@ def plan_way(label: str, q_start: Array, q: Array, held: HeldBoard, config: Cell
     """
     speed = min(_JOINT_SPEED_RAD_S, config.motion.joint_speed_rad_s)
     move = JointMove(label, q, speed, config.motion.joint_acceleration_rad_s2)
-    checked = check_plan(MotionPlan(label, q_start, (move,)), config)
+    checked = check_path(MotionPlan(label, q_start, (move,)), config)
     steps = max(2, int(np.ceil(np.abs(q - q_start).max() / _PATH_STEP_RAD)) + 1)
     path = q_start + np.linspace(0.0, 1.0, steps)[:, None] * (q - q_start)
     # Where the arm stands now is a fact: only where it goes is checked.

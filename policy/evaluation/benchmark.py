@@ -24,10 +24,10 @@ from policy.evaluation.metrics import Metrics, measure
 from policy.evaluation.suites import find_suite
 from policy.evaluation.trials import Failure, Trial, TrialResult, run_trial
 from policy.rollouts import run_tasks
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
-from robotcell.jobs.job import make_run_dir
-from robotcell.motion.path_check import check_config
+from robotcell.jobs.run_folder import make_run_dir
+from robotcell.motion.config_check import check_config
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence

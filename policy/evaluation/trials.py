@@ -15,9 +15,11 @@ from typing import TYPE_CHECKING
 import cv2
 
 from policy import make_policy
-from robotcell.config.schema import BackendChoice, JournalPlace
+from robotcell.config import BackendChoice, JournalPlace
 from robotcell.errors import CellError
-from robotcell.jobs.job import Decision, Outcome, Result, View, run_job
+from robotcell.jobs.job import Decision, run_job
+from robotcell.jobs.verdict import Outcome, Result
+from robotcell.perception.view import View
 from robotcell.jobs.journal import Journal
 from robotcell.jobs.pictures import describe, draw_decision, draw_view
 from robotcell.perception.colors import PALETTE
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
     from policy.evaluation.suites import Case
     from robotcell.cell import Cell
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.jobs.policy_api import Action, Observation, Policy
     from sim_twin.world.world import World
 

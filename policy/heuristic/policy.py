@@ -15,7 +15,7 @@ from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import Action, Primitive
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.jobs.policy_api import Observation
 
 # A grasp that scores less is worth a push first, where one is allowed.

@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from policy.shadows import cell_centers
 from robotcell.geometry import rg2
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from policy.shadows import Surface
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
     from robotcell.geometry.transforms import Array
 
 # Outlines are moved on a grid of this size: a push lands within some millimetres at best.

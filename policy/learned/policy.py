@@ -33,7 +33,7 @@ from robotcell.jobs.policy_api import Action, Primitive
 
 if TYPE_CHECKING:
     from policy.network.inference import Inference
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.jobs.policy_api import Observation
 
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside

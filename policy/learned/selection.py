@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from policy.push.line import PushLine, normal, push_line, push_starts
 from robotcell.errors import ConfigError
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

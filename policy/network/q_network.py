@@ -13,7 +13,7 @@ from torch import nn
 from torch.nn import functional
 
 from policy.network.encoding import CHANNELS
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -17,11 +17,11 @@ import numpy as np
 import numpy.typing as npt
 
 from robotcell.geometry import rg2
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 from robotcell.perception.segmentation import MIN_OBJECT_M
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
     from robotcell.geometry.transforms import Array
 
 # Room that the closed fingers need to come down: half their diagonal, and 1 mm for noise and calibration.

@@ -13,7 +13,7 @@ from scipy.ndimage import find_objects
 
 from policy.push.border import border_cells, stands
 from policy.push.physics import Prism, SlidingTable
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 from robotcell.perception.heightmap import upper_height
 from robotcell.perception.segmentation import MIN_OBJECT_M
 

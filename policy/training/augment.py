@@ -13,7 +13,7 @@ from policy.network.encoding import encode
 from policy.network.q_network import GRASP
 from policy.network.rotation import turn_matrix
 from policy.training.shard import unpack_height
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.motion.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from policy.training.replay import View

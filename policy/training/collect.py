@@ -20,7 +20,7 @@ from policy.push.line import push_line
 from policy.shadows import estimate_surface
 from policy.training.environment import GRASP, PUSH, Outcome, PushGraspEnv, State, Trial
 from policy.training.shard import Shard, pack_height
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from policy.network.inference import Inference
     from policy.training.config import CollectSettings
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 # Of the attempts that exploit, a share takes the best action; the others one of so many of the best.
 _GREEDY_SHARE = 0.4

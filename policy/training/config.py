@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from robotcell.config.schema import read_toml, wrong_values
+from robotcell.config import read_toml, wrong_values
 from robotcell.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -23,12 +23,14 @@ from policy.network.q_network import GRASP, PUSH
 from policy.push.border import border_occupancy
 from policy.push.line import PushLine, free_to_descend, push_line
 from policy.training.scenes import training_scene
-from robotcell.config.schema import CameraMount, CellConfig
+from robotcell.config import CameraMount, CellConfig
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import look_at, make_transform
-from robotcell.jobs.policy_api import ROTATIONS
 from robotcell.motion.executor import Ending
-from robotcell.motion.plan import grasp_height, near_height, push_height
+from robotcell.motion.grasp import grasp_height
+from robotcell.motion.push import push_height
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.tool import near_height
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 from robotcell.perception.segmentation import MIN_OBJECT_M
 from sim_twin.devices.camera import TwinCamera

@@ -20,7 +20,7 @@ from sim_twin.scenes.scene import Scene, SceneObject, place
 from sim_twin.scenes.shapes import BLOCK_NAMES, Shape, block, shape_of
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
 
 # Shares of objects: a block as it is, a block scaled along each axis, and another solid.

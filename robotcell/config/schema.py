@@ -1,32 +1,16 @@
-"""`cell.toml`: one file that describes a cell, checked as a whole.
-
-With no file the twin with its defaults. Lengths in metres, angles in radians, base frame.
-"""
+"""The tables of `cell.toml`. Lengths in metres, angles in radians, base frame."""
 
 from __future__ import annotations
 
-import sys
-from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from robotcell.config.calibration_file import CameraCalibration, load_calibration
-from robotcell.errors import ConfigError
 from robotcell.geometry import rg2
 from robotcell.geometry.transforms import Array, check_transform, look_at
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from robotcell.cell import Cell
 
 
 def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
@@ -38,8 +22,6 @@ def _ordered(interval: tuple[float, float]) -> tuple[float, float]:
 Interval = Annotated[tuple[float, float], AfterValidator(_ordered)]
 Positive = Annotated[float, Field(gt=0)]
 Vector3 = tuple[float, float, float]
-
-_DOCS = "docs/configuration.md"
 
 
 class _Table(BaseModel):
@@ -98,6 +80,11 @@ class KeepOut(_Table):
     x: Interval
     y: Interval
     z: Interval
+
+    def corners(self) -> tuple[Array, Array]:
+        """The lowest and the highest corner (3,), base frame [m]."""
+        low, high = np.array([self.x, self.y, self.z]).T
+        return low, high
 
 
 class Motion(_Table):
@@ -252,127 +239,3 @@ class CellConfig(_Table):
     policy: PolicyChoice = PolicyChoice()
     journal: JournalPlace = JournalPlace()
     backend: BackendChoice = BackendChoice()
-
-
-class Backend(Protocol):
-    """An entry point of the group `robotcell.backends`: a class with these two members."""
-
-    Options: type[BaseModel]
-
-    @staticmethod
-    def open(config: CellConfig) -> Cell:
-        """The cell's devices, not yet connected; `config.backend.options` fits `Options`."""
-        ...
-
-
-def find_backend(name: str) -> Backend:
-    """The backend of that name.
-
-    Raises:
-        ConfigError: there is none, or it cannot be imported; the message lists those that are installed.
-    """
-    installed = {entry.name: entry for entry in entry_points(group="robotcell.backends")}
-    if name not in installed:
-        raise ConfigError(f"no backend is called {name!r}; installed: {', '.join(sorted(installed)) or 'none'}")
-    try:
-        backend: Backend = installed[name].load()
-    except ImportError as error:
-        raise ConfigError(
-            f"backend {name!r} cannot be imported ({error}); install its extra, for the twin: "
-            "pip install 'robotcell[twin]'"
-        ) from error
-    return backend
-
-
-def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> CellConfig:
-    """Read and check a cell file.
-
-    Args:
-        path: a TOML file; None for the twin with its defaults.
-        overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
-
-    Raises:
-        ConfigError: naming every bad key at once, each with its value and what is allowed.
-    """
-    values = read_toml(path, "examples/cell.toml") if path else {}
-    if path:
-        _beside(values, path)
-    for key, value in (overrides or {}).items():
-        _set(values, key, value)
-    problems: list[str] = []
-    config = None
-    try:
-        config = CellConfig.model_validate(values)
-    except ValidationError as error:
-        problems += wrong_values(error, _DOCS)
-    backend_table = values.get("backend", {})
-    if isinstance(backend_table, dict):
-        try:
-            backend = find_backend(str(backend_table.get("name", BackendChoice().name)))
-            backend.Options.model_validate(backend_table.get("options", {}))
-        except ConfigError as error:
-            problems.append(f"backend.name: {error}")
-        except ValidationError as error:
-            problems += wrong_values(error, _DOCS, ("backend", "options"))
-    if config is None or problems:
-        place = str(path) if path else "the cell's settings"
-        raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
-    return config
-
-
-def read_toml(path: Path, example: str) -> dict[str, Any]:
-    """The values of a TOML file.
-
-    Args:
-        path: of the file.
-        example: a file to start from, named where there is none.
-
-    Raises:
-        ConfigError: it cannot be read, or is no TOML.
-    """
-    try:
-        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-        return values
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; start from {example}") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from error
-
-
-def wrong_values(error: ValidationError, docs: str, prefix: tuple[str, ...] = ()) -> list[str]:
-    """A line for each wrong key of a file: the key, its value and what is wrong with it.
-
-    Args:
-        error: of its validation.
-        docs: the page that lists the keys.
-        prefix: of the keys, where a part of the file was validated.
-    """
-    lines = []
-    for detail in error.errors():
-        key = ".".join(str(part) for part in (*prefix, *detail["loc"]))
-        if detail["type"] == "missing":
-            lines.append(f"{key}: missing")
-        elif detail["type"] == "extra_forbidden":
-            lines.append(f"{key} = {detail['input']!r}: unknown key; see {docs} for those that exist")
-        else:
-            lines.append(f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}")
-    return lines
-
-
-def _beside(values: dict[str, Any], path: Path) -> None:
-    """A relative path of the calibration file starts at the folder of the cell's file."""
-    camera = values.get("camera")
-    if isinstance(camera, dict) and isinstance(camera.get("calibration"), str):
-        camera["calibration"] = str(path.parent / camera["calibration"])
-
-
-def _set(values: dict[str, Any], dotted_key: str, value: object) -> None:
-    *tables, key = dotted_key.split(".")
-    for table in tables:
-        inner = values.setdefault(table, {})
-        if not isinstance(inner, dict):
-            return  # the file holds something else there, which the validation reports
-        values = inner
-    values[key] = value

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
-from robotcell.cell import Cell
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
+from robotcell.interfaces import Devices
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 
 class HardwareOptions(BaseModel):
@@ -32,12 +32,11 @@ class HardwareBackend:
     Options: type[BaseModel] = HardwareOptions
 
     @staticmethod
-    def open(config: CellConfig) -> Cell:
-        """The cell of a configuration, not yet connected."""
+    def open(config: CellConfig) -> Devices:
+        """The devices of a configuration, not yet connected."""
         options = HardwareOptions.model_validate(config.backend.options)
         clock = WallClock()
-        return Cell(
-            config,
+        return Devices(
             UR5e(options.arm, clock),
             RG2(options.gripper, clock),
             D415(options.camera, config.camera, clock),

@@ -1,4 +1,4 @@
-"""A model of arm, gripper and obstacles that is coarse, conservative and fast: spheres against boxes.
+"""A model of arm, gripper and obstacles that is coarse, conservative and fast: spheres, and points for the fingers.
 
 Each link is a chain of spheres along its axis, in the frames of `ur5e.link_frames`. Radii cover the housings of
 the UR5e (joint housings 120 to 150 mm, upper arm 110 mm, forearm 90 mm and wrists 90 mm across) and of the RG2's body.
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from robotcell.config.schema import CellConfig, KeepOut
 from robotcell.geometry import rg2, ur5e
 
 if TYPE_CHECKING:
@@ -22,11 +21,6 @@ if TYPE_CHECKING:
 _UPPER_ARM_OFFSET_M = 0.138
 _SPACING_M = 0.03
 FINGER_SPACING_M = 0.014
-# The camera's housing and its post stand behind its optical centre.
-_CAMERA_M = 0.12
-_POST_M = 0.06
-# A camera that looks straighter down than this hangs from above: a post would stand in its view.
-_HANGING_SLOPE = 0.1
 
 
 @dataclass(frozen=True)
@@ -84,37 +78,8 @@ def sphere_centers(q: npt.ArrayLike) -> Array:
     return np.asarray(np.einsum("...nij,nj->...ni", frames[..., :3, :3], SPHERES.center) + frames[..., :3, 3])
 
 
-def obstacles(config: CellConfig) -> tuple[KeepOut, ...]:
-    """Everything that arm and gripper must not enter: the keep-outs of the file, the bin, the camera and its post."""
-    table = config.table.height_m
-    (bx, by), (sx, sy) = config.bin.center, config.bin.size
-    bin_box = _box("bin", (bx, by, table + config.bin.wall_height_m / 2), (sx, sy, config.bin.wall_height_m))
-    x, y, z = config.camera.pose()[:3, 3]
-    camera = _box("camera", (x, y, z), (_CAMERA_M, _CAMERA_M, _CAMERA_M))
-    post = camera_post(config)
-    return (*config.keep_out, bin_box, camera, *((post,) if post else ()))
-
-
-def camera_post(config: CellConfig) -> KeepOut | None:
-    """The post that carries the camera, on the side that it does not look at; None for one that hangs from above."""
-    T = config.camera.pose()
-    x, y, z = T[:3, 3]
-    slope = float(np.linalg.norm(T[:2, 2]))
-    if slope < _HANGING_SLOPE:
-        return None
-    px, py = np.array([x, y]) - (_CAMERA_M + _POST_M) / 2 * T[:2, 2] / slope
-    low, high = config.table.height_m, z + _CAMERA_M / 2
-    return _box("camera post", (px, py, (low + high) / 2), (_POST_M, _POST_M, max(high - low, _POST_M)))
-
-
-def _box(name: str, center: tuple[float, float, float], size: tuple[float, float, float]) -> KeepOut:
-    x, y, z = ((c - s / 2, c + s / 2) for c, s in zip(center, size, strict=True))
-    return KeepOut(name=name, x=x, y=y, z=z)
-
-
-def box_distance(box: KeepOut, points: Array) -> npt.NDArray[np.float64]:
-    """Distance [m] of points (..., 3) from a box; 0 inside."""
-    low, high = np.array([box.x, box.y, box.z]).T
+def box_distance(low: Array, high: Array, points: Array) -> npt.NDArray[np.float64]:
+    """Distance [m] of points (..., 3) from the box between the corners `low` and `high` (3,); 0 inside."""
     return np.asarray(np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=-1))
 
 
@@ -143,9 +108,22 @@ def finger_points(T_base_tcp: Array, load_m: float) -> Array:
     return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], grid) + T_base_tcp[..., None, :3, 3])
 
 
-def blocks_view(q: npt.ArrayLike, config: CellConfig) -> bool:
-    """Whether arm or gripper at joint angles q (6,) stand between the camera and the workspace."""
-    eye = config.camera.pose()[:3, 3]
+def blocks_view(
+    q: npt.ArrayLike,
+    eye: Array,
+    x_range: tuple[float, float],
+    y_range: tuple[float, float],
+    table_height_m: float,
+) -> bool:
+    """Whether arm or gripper stand between a camera and a rectangle of the table.
+
+    Args:
+        q: joint angles (6,) [rad].
+        eye: position (3,) of the camera, base frame [m].
+        x_range: of the rectangle, base frame [m].
+        y_range: likewise.
+        table_height_m: z of the table, base frame.
+    """
     T_tcp = ur5e.forward(q) @ rg2.T_FLANGE_TCP
     fingers = finger_points(T_tcp, 0.0)
     centers = np.concatenate([sphere_centers(q), fingers])
@@ -153,10 +131,10 @@ def blocks_view(q: npt.ArrayLike, config: CellConfig) -> bool:
     below = centers[:, 2] < eye[2] - radii
     away = centers[below] - eye
     # Their shadows on the table, as if the camera were a lamp.
-    stretch = (eye[2] - config.table.height_m) / -away[:, 2]
+    stretch = (eye[2] - table_height_m) / -away[:, 2]
     x, y = (eye[:2] + stretch[:, None] * away[:, :2]).T
     size = radii[below] * stretch * np.linalg.norm(away, axis=1) / -away[:, 2]
-    (x0, x1), (y0, y1) = config.workspace.x, config.workspace.y
+    (x0, x1), (y0, y1) = x_range, y_range
     return bool(((x > x0 - size) & (x < x1 + size) & (y > y0 - size) & (y < y1 + size)).any())
 
 

@@ -5,13 +5,30 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-Array: TypeAlias = npt.NDArray[np.float64]
+from robotcell.interfaces import Array
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+__all__ = [
+    "Array",
+    "check_transform",
+    "cross",
+    "interpolate_transforms",
+    "invert_transform",
+    "look_at",
+    "make_transform",
+    "matrix_to_rotvec",
+    "rotation_angle",
+    "rotation_z",
+    "rotvec_to_matrix",
+    "transform_points",
+]
 
 # How far R R^T may be from the identity; single-precision files and printed digits stay below it.
 _ROTATION_TOLERANCE = 1e-4

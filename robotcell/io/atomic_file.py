@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
+
+from robotcell.errors import CellError, StorageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -19,7 +21,7 @@ def replaced(path: Path) -> Iterator[Path]:
     there.
 
     Raises:
-        OSError: it cannot be written.
+        StorageError: it cannot be written.
     """
     part = path.with_name(f"{path.name}.part")
     try:
@@ -30,8 +32,13 @@ def replaced(path: Path) -> Iterator[Path]:
         finally:
             os.close(descriptor)
         part.replace(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and not isinstance(error, CellError):
+            raise StorageError(
+                f"{path} cannot be written: {error.strerror or error}; check the folder and the disk"
+            ) from error
         raise
 
 
@@ -39,7 +46,7 @@ def write_whole(path: Path, text: str) -> None:
     """Write a text file by `replaced`.
 
     Raises:
-        OSError: it cannot be written.
+        StorageError: it cannot be written.
     """
     with replaced(path) as part:
         part.write_text(text, encoding="utf-8")

@@ -11,102 +11,19 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import JSON, ForeignKey, create_engine, event, func, select
+from sqlalchemy import create_engine, event, func, select
 from sqlalchemy.engine import make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, OperationalError, SQLAlchemyError
-from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
+from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+from sqlalchemy.orm import Session
 
-from robotcell.errors import ConfigError, DeviceFault
-from robotcell.jobs.policy_api import Primitive
+from robotcell.errors import ConfigError, StorageError
+from robotcell.jobs.journal_schema import bring_up_to_date
+from robotcell.jobs.journal_tables import GRASP, ActionRow, Frame, Job, OutcomeRow
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from typing_extensions import Self
-
-
-# Processes that open a new database together may each find that another has just made a table.
-_CREATE_TRIES = 5
-
-
-class _Base(DeclarativeBase):
-    pass
-
-
-class Job(_Base):
-    """One call of pick-goal or pick-all."""
-
-    __tablename__ = "jobs"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    started: Mapped[datetime]
-    ended: Mapped[datetime | None]
-    # Colours in order, or null for pick-all.
-    goals: Mapped[list[str] | None] = mapped_column(JSON)
-    policy: Mapped[str]
-    config: Mapped[dict[str, Any]] = mapped_column(JSON)
-    run_dir: Mapped[str]
-    # running, complete, incomplete or stopped
-    status: Mapped[str] = mapped_column(default="running")
-    reason: Mapped[str] = mapped_column(default="")
-    # Duration on the cell's clock.
-    cell_s: Mapped[float | None]
-    actions: Mapped[list[ActionRow]] = relationship(back_populates="job", order_by="ActionRow.id")
-
-
-class Frame(_Base):
-    """A frame that a decision was made on, by reference to its files."""
-
-    __tablename__ = "frames"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    job_id: Mapped[int] = mapped_column(ForeignKey("jobs.id"))
-    number: Mapped[int]
-    t: Mapped[float]
-    color_file: Mapped[str]
-    depth_file: Mapped[str]
-    coverage: Mapped[float]
-    tilt_rad: Mapped[float]
-    offset_m: Mapped[float]
-
-
-class ActionRow(_Base):
-    """An action, committed before it starts."""
-
-    __tablename__ = "actions"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    job_id: Mapped[int] = mapped_column(ForeignKey("jobs.id"))
-    frame_id: Mapped[int] = mapped_column(ForeignKey("frames.id"))
-    goal: Mapped[str | None]
-    primitive: Mapped[str]
-    row: Mapped[int]
-    col: Mapped[int]
-    rotation: Mapped[int]
-    x: Mapped[float]
-    y: Mapped[float]
-    z: Mapped[float]
-    q_value: Mapped[float]
-    started_s: Mapped[float]
-    job: Mapped[Job] = relationship(back_populates="actions")
-    frame: Mapped[Frame] = relationship()
-    outcome: Mapped[OutcomeRow | None] = relationship(back_populates="action")
-
-
-class OutcomeRow(_Base):
-    """What came of an action, committed after it ended; an action without one was cut off."""
-
-    __tablename__ = "outcomes"
-
-    action_id: Mapped[int] = mapped_column(ForeignKey("actions.id"), primary_key=True)
-    result: Mapped[str]
-    success: Mapped[bool]
-    # Colour of the object that left the table.
-    picked: Mapped[str | None]
-    detail: Mapped[str]
-    peak_force_n: Mapped[float]
-    ended_s: Mapped[float]
-    action: Mapped[ActionRow] = relationship(back_populates="outcome")
 
 
 @dataclass(frozen=True)
@@ -137,37 +54,32 @@ class Journal:
         url: any SQLAlchemy URL; the folder of a SQLite file is made.
 
     Raises:
-        ConfigError: the URL is malformed or the database cannot be opened.
+        ConfigError: the URL is malformed, or the database is not one of this program or of a newer one.
+        StorageError: the database cannot be opened or written.
     """
 
     def __init__(self, url: str) -> None:
-        shown = url
         try:
             parsed = make_url(url)
             shown = parsed.render_as_string(hide_password=True)
             is_sqlite = parsed.get_backend_name() == "sqlite"
+            self._engine = create_engine(parsed)
+        except (ArgumentError, ImportError, SQLAlchemyError) as error:
+            raise ConfigError(f"journal.url = {url!r}: the journal cannot be opened: {_cause(error)}") from error
+        try:
             if is_sqlite and parsed.database not in {None, "", ":memory:"}:
                 Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
-            self._engine = create_engine(parsed)
             if is_sqlite:
                 event.listen(self._engine, "connect", _use_write_ahead_log)
-            self._create_tables()
-        except (ArgumentError, ImportError, OSError, SQLAlchemyError) as error:
-            raise ConfigError(f"journal.url = {shown!r}: the journal cannot be opened: {_cause(error)}") from error
-
-    def _create_tables(self) -> None:
-        """Create what is missing, also when another process does so at the same moment."""
-        for attempt in range(_CREATE_TRIES):
-            try:
-                _Base.metadata.create_all(self._engine)
-                return
-            except OperationalError:
-                if attempt == _CREATE_TRIES - 1:
-                    self._engine.dispose()
-                    raise
-            except SQLAlchemyError:
-                self._engine.dispose()
-                raise
+            bring_up_to_date(self._engine)
+        except (OSError, SQLAlchemyError) as error:
+            self._engine.dispose()
+            raise StorageError(
+                f"journal.url = {shown!r}: the journal cannot be opened: {_cause(error)}; check folder and database"
+            ) from error
+        except ConfigError:
+            self._engine.dispose()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -241,7 +153,7 @@ class Journal:
         with self._reading() as session:
             rows = session.execute(ended).all()
             cell_s = session.scalar(select(Job.cell_s).where(Job.id == job_id))
-        grasps = [row for row in rows if row.primitive == Primitive.GRASP.value]
+        grasps = [row for row in rows if row.primitive == GRASP]
         successes = sum(row.success for row in grasps)
         return Metrics(
             actions=len(rows),
@@ -273,7 +185,7 @@ class Journal:
             with Session(self._engine, expire_on_commit=False) as session, session.begin():
                 yield session
         except SQLAlchemyError as error:
-            raise DeviceFault(f"the journal cannot be written: {_cause(error)}; check disk and database") from error
+            raise StorageError(f"the journal cannot be written: {_cause(error)}; check disk and database") from error
 
 
 def _use_write_ahead_log(connection: Any, _record: object) -> None:

@@ -10,18 +10,21 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from robotcell.errors import CellError
+from robotcell.errors import StorageError
 from robotcell.geometry import rg2
-from robotcell.geometry.transforms import invert_transform, transform_points
-from robotcell.jobs.policy_api import Action, Primitive
-from robotcell.motion.plan import push_segment
+from robotcell.io.images import write_image
+from robotcell.motion.grasp import Grasp
+from robotcell.perception.goals import goal_color
+from robotcell.perception.heightmap import Heightmap, build_heightmap
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from robotcell.config.schema import CellConfig
-    from robotcell.jobs.job import Decision, Outcome, View
-    from robotcell.perception.heightmap import Heightmap
+    from robotcell.config import CellConfig
+    from robotcell.jobs.decision import Decision
+    from robotcell.jobs.verdict import Outcome
+    from robotcell.motion.actions import Action
+    from robotcell.perception.view import View
 
 _Picture = npt.NDArray[np.uint8]
 _ToPixel = Callable[[float, float], tuple[int, int]]
@@ -40,7 +43,7 @@ _ANIMATION_STEP_MS = 900
 _ANIMATION_END_MS = 2500
 
 
-class Album:
+class JobPictures:
     """An observer of a job that leaves `step-NNN.png` and `summary.gif` in the folder of the run."""
 
     def __init__(self, config: CellConfig) -> None:
@@ -66,7 +69,7 @@ class Album:
         caption = f"{describe(decision)}: {outcome.result.value} ({outcome.detail})"
         page = draw_decision(decision, self._config, caption, color)
         if self._folder:
-            save_picture(page, self._folder / f"step-{decision.index:03d}.png")
+            write_image(self._folder / f"step-{decision.index:03d}.png", page)
         self._pages.append(_small(page))
 
     def finish(self, caption: str) -> None:
@@ -74,22 +77,23 @@ class Album:
         if not self._folder or not self._view:
             return
         page = draw_view(self._view, None, None, self._config, caption, _NEUTRAL)
-        save_picture(page, self._folder / "end.png")
+        write_image(self._folder / "end.png", page)
         pages = [*self._pages, _small(page)]
         durations = [_ANIMATION_STEP_MS] * (len(pages) - 1) + [_ANIMATION_END_MS]
         path = self._folder / "summary.gif"
         try:
             pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
         except OSError as error:
-            raise _not_written(path) from error
+            raise StorageError(f"{path} cannot be written: {error.strerror}; check the folder and the disk") from error
 
 
 def describe(decision: Decision) -> str:
     """One line on a decision: its number, what it does and how sure the policy is."""
     action = decision.action
+    name = "grasp" if isinstance(action, Grasp) else "push"
     goal = f" for {decision.goal}" if decision.goal else ""
     angle = f"{np.degrees(action.theta):.1f} deg"
-    return f"{decision.index}. {action.primitive.value}{goal} at {angle}, q {action.q_value:.2f}"
+    return f"{decision.index}. {name}{goal} at {angle}, q {action.q_value:.2f}"
 
 
 def draw_decision(
@@ -99,7 +103,7 @@ def draw_decision(
     labels = decision.view.segmentation.labels
     goal = None
     if decision.goal is not None:
-        chosen = [i.label for i in decision.view.segmentation.instances if i.color_name == decision.goal]
+        chosen = [i.label for i in decision.view.segmentation.instances if i.color_name == goal_color(decision.goal)]
         goal = np.isin(labels, chosen)
     return draw_view(decision.view, decision.action, goal, config, caption, color)
 
@@ -116,26 +120,16 @@ def draw_view(
 
     The heightmaps are turned so that base x points up and base y to the left, as the camera sees the table.
     """
+    heightmap = view.heightmap
+    if heightmap.workspace != config.workspace:
+        # The policy decided on a map of its own; people see the one that the cell's file asks for.
+        heightmap = build_heightmap(view.frame, view.camera, config.workspace, config.table.height_m)
     camera = _camera_panel(view, action, config)
-    panels = [camera, _map_panel(view.heightmap, action, goal, config), _height_panel(view.heightmap)]
+    panels = [camera, _map_panel(heightmap, action, goal, config), _height_panel(heightmap)]
     body = np.hstack(panels)
     strip = np.full((_CAPTION_PX, body.shape[1], 3), color, np.uint8)
     cv2.putText(strip, caption, (10, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.6, _WHITE, 1, cv2.LINE_AA)
     return np.vstack([strip, body])
-
-
-def save_picture(picture: _Picture, path: Path) -> None:
-    """Write an RGB picture as PNG.
-
-    Raises:
-        CellError: it cannot be written.
-    """
-    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise _not_written(path)
-
-
-def _not_written(path: Path) -> CellError:
-    return CellError(f"{path} cannot be written: check that its folder exists and the disk has room")
 
 
 def _small(page: _Picture) -> Image.Image:
@@ -148,15 +142,21 @@ def _camera_panel(view: View, action: Action | None, config: CellConfig) -> _Pic
     frame = view.frame
     panel = frame.color.copy()
     if action is not None:
-        point = transform_points(invert_transform(config.camera.pose()), np.array(action.xyz))
-        if point[2] > 0:
-            u = round(frame.intrinsics.fx * point[0] / point[2] + frame.intrinsics.cx)
-            v = round(frame.intrinsics.fy * point[1] / point[2] + frame.intrinsics.cy)
-            size = frame.intrinsics.width // 40
-            cv2.drawMarker(panel, (u, v), _BLACK, cv2.MARKER_CROSS, size, 5)
-            cv2.drawMarker(panel, (u, v), _ACTION, cv2.MARKER_CROSS, size, 2)
+        point = np.array([_place(action, config.table.height_m)])
+        u, v, depth = view.camera.project(point, frame.intrinsics)[0]
+        if depth > 0:
+            size, at = frame.intrinsics.width // 40, (round(u), round(v))
+            cv2.drawMarker(panel, at, _BLACK, cv2.MARKER_CROSS, size, 5)
+            cv2.drawMarker(panel, at, _ACTION, cv2.MARKER_CROSS, size, 2)
     width = round(panel.shape[1] * _PANEL_PX / panel.shape[0])
     return np.asarray(cv2.resize(panel, (width, _PANEL_PX), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _place(action: Action, table_height_m: float) -> tuple[float, float, float]:
+    """Where an action begins, base frame [m]: on the surface that is grasped, or at the top of what is pushed."""
+    if isinstance(action, Grasp):
+        return action.x, action.y, table_height_m + action.surface_m
+    return *action.start, table_height_m + action.top_m
 
 
 def _map_panel(
@@ -180,19 +180,20 @@ def _map_panel(
         )
         return round((rows - row) * scale), round((cols - col) * scale)
 
-    if action is not None and action.primitive is Primitive.GRASP:
+    if isinstance(action, Grasp):
         _draw_fingers(panel, action, config, pixel)
     elif action is not None:
-        start, end = push_segment(action, config)
         for color, thickness in ((_BLACK, 6), (_ACTION, 3)):
-            cv2.arrowedLine(panel, pixel(*start), pixel(*end), color, thickness, cv2.LINE_AA, tipLength=0.2)
+            cv2.arrowedLine(
+                panel, pixel(*action.start), pixel(*action.end), color, thickness, cv2.LINE_AA, tipLength=0.2
+            )
     return panel
 
 
-def _draw_fingers(panel: _Picture, action: Action, config: CellConfig, pixel: _ToPixel) -> None:
+def _draw_fingers(panel: _Picture, grasp: Grasp, config: CellConfig, pixel: _ToPixel) -> None:
     """The two finger tips at the pre-shape, and the line on which they close."""
-    x, y, _ = action.xyz
-    along = np.array([np.cos(action.theta), np.sin(action.theta)])
+    x, y = grasp.x, grasp.y
+    along = np.array([np.cos(grasp.theta), np.sin(grasp.theta)])
     across = np.array([-along[1], along[0]]) * rg2.FINGER_BREADTH_M / 2
     inner = config.gripper.preshape_m / 2
     for side in (-1, 1):

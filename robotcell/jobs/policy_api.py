@@ -6,17 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from robotcell.errors import NoTarget
-from robotcell.motion.grasp import Grasp
-from robotcell.motion.push import Push
+from robotcell.motion.actions import Action
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
     from robotcell.perception.heightmap import Heightmap
 
-Action: TypeAlias = Grasp | Push
+__all__ = ["Action", "Observation", "PickAny", "PickGoal", "Policy", "Task", "Uncover"]
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,14 +12,14 @@ import numpy as np
 
 from robotcell.errors import CellError, DeviceFault, GuardTripped
 from robotcell.geometry.transforms import rotation_angle
-from robotcell.motion.path_check import Guard
+from robotcell.motion.guard import Guard, Latch
 from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove
 
 if TYPE_CHECKING:
-    from robotcell.cell import Cell
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
+    from robotcell.interfaces import Devices
     from robotcell.motion.path_check import CheckedPlan
-    from robotcell.motion.plan import MotionPlan, Step
 
 # 125 Hz: the slower of the two rates at which UR controllers report.
 PERIOD_S = 0.008
@@ -32,6 +33,9 @@ _STOP_TIMEOUT_S = 2.0
 # How far from its target a motion may have ended.
 _REACHED_RAD = 0.02
 _REACHED_M = 0.004
+# A straight motion that ends with joints this far from those that were checked went another way. The kinematics of a
+# real arm differ from the nominal ones by up to a centimetre, a fifth of this at the arm's reach.
+_SAME_WAY_RAD = 0.1
 
 
 class Ending(enum.Enum):
@@ -49,22 +53,31 @@ class Execution:
     Attributes:
         ending: how it ended.
         step: label of the step that ended it.
-        peak_force_n: largest contact force during guarded motions.
+        peak_force_n: largest contact force during guarded motions, and of the grip that ended it.
+        grip_force_n: largest contact force while the fingers moved; NaN if they never did.
         width_m: opening of the fingers at the last check for a held object; NaN without one.
     """
 
     ending: Ending
     step: str
     peak_force_n: float
+    grip_force_n: float
     width_m: float
 
 
 class Executor:
-    """Runs plans on the devices of a cell; the cell's latch stands over all of them."""
+    """Runs plans on the devices of a cell.
 
-    def __init__(self, cell: Cell) -> None:
-        self._cell = cell
-        self._guard = Guard(cell.config, cell.latch)
+    Args:
+        devices: of the cell.
+        config: of the cell.
+        latch: of the cell: it stands over all executors.
+    """
+
+    def __init__(self, devices: Devices, config: CellConfig, latch: Latch) -> None:
+        self._devices = devices
+        self._latch = latch
+        self._guard = Guard(config, latch)
 
     def run(self, checked: CheckedPlan) -> Execution:
         """Run a plan to its end, or to the first contact or empty grip.
@@ -76,41 +89,40 @@ class Executor:
             GuardTripped, DeviceFault, ConnectionLost, UnsafeMotion: as the guard and the devices do.
         """
         plan = checked.plan
-        self._guard.check_start(self._cell.arm.state(), self._cell.clock.now(), plan)
+        self._guard.check_start(self._devices.arm.state(), self._devices.clock.now(), plan)
         try:
-            return self._run_steps(plan)
+            return self._run_steps(checked)
         except BaseException as error:
-            self._cell.latch.trip(f"{plan.label} was cut short: {error if str(error) else type(error).__name__}")
+            self._latch.trip(f"{plan.label} was cut short: {error if str(error) else type(error).__name__}")
             self._stop()
             raise
 
-    def recover(self) -> None:
-        """Leave a stop, because an operator asked for it. The next plan starts from measured joints."""
-        self._cell.arm.recover()
-        self._cell.latch.clear()
-
-    def _run_steps(self, plan: MotionPlan) -> Execution:
-        peak_force, width = 0.0, float("nan")
-        step: Step | None = None
-        for step in plan.steps:
-            if isinstance(step, Grip):
-                contact, force = self._grip(step)
-                if contact:
-                    return Execution(Ending.CONTACT, step.label, force, width)
-            elif isinstance(step, CheckHold):
-                width = self._cell.gripper.state().width_m
+    def _run_steps(self, checked: CheckedPlan) -> Execution:
+        peak_force, grip_force, width = 0.0, math.nan, math.nan
+        ending, label = Ending.DONE, ""
+        for step, path in zip(checked.plan.steps, checked.joint_paths, strict=True):
+            label = step.label
+            if isinstance(step, CheckHold):
+                width = self._devices.gripper.state().width_m
                 if width < step.min_width_m:
-                    return Execution(Ending.EMPTY, step.label, peak_force, width)
+                    ending = Ending.EMPTY
+                    break
+                continue
+            if isinstance(step, Grip):
+                contact, force = self._grip(step, checked.lowest_tip_m)
+                grip_force = force if math.isnan(grip_force) else max(grip_force, force)
+                peak_force = max(peak_force, force) if contact else peak_force
             else:
-                contact, force = self._move(step)
+                contact, force = self._move(step, path, checked.lowest_tip_m)
                 peak_force = max(peak_force, force)
-                if contact:
-                    return Execution(Ending.CONTACT, step.label, peak_force, width)
-        return Execution(Ending.DONE, step.label if step else "", peak_force, width)
+            if contact:
+                ending = Ending.CONTACT
+                break
+        return Execution(ending, label, peak_force, grip_force, width)
 
-    def _move(self, step: JointMove | LinearMove) -> tuple[bool, float]:
-        """Run one motion; whether a guarded one met something, and its largest contact force [N]."""
-        arm = self._cell.arm
+    def _move(self, step: JointMove | LinearMove, path: Array, lowest_tip_m: float) -> tuple[bool, float]:
+        """Run one motion, checked as path (N, 6) [rad]; whether a guarded one met something, and its peak force [N]."""
+        arm = self._devices.arm
         contact_force = step.contact_force_n if isinstance(step, LinearMove) else None
         # Force sensors drift, so contact is judged against the force before the motion.
         wrench_before = arm.state().wrench
@@ -119,10 +131,10 @@ class Executor:
         else:
             arm.start_linear(step.T_base_tcp, step.speed_m_s, step.acceleration_m_s2)
         peak, contact = 0.0, False
-        moved_at, q_moved = self._cell.clock.now(), arm.state().q
+        moved_at, q_moved = self._devices.clock.now(), arm.state().q
         while arm.moving:
-            state, now = arm.state(), self._cell.clock.now()
-            self._guard.check(state, now)
+            state, now = arm.state(), self._devices.clock.now()
+            self._guard.check(state, now, lowest_tip_m)
             if float(np.abs(state.q - q_moved).max()) > _STILL_RAD:
                 moved_at, q_moved = now, state.q
             elif now - moved_at > _STALL_S:
@@ -137,14 +149,14 @@ class Executor:
                     contact = True
                     arm.stop()
             arm.kick()
-            self._cell.clock.sleep(PERIOD_S)
+            self._devices.clock.sleep(PERIOD_S)
         state = arm.state()
-        self._guard.check(state, self._cell.clock.now())
+        self._guard.check(state, self._devices.clock.now(), lowest_tip_m)
         if not contact:
-            self._check_reached(step, state.q, state.T_base_tcp)
+            self._check_reached(step, path[-1], state.q, state.T_base_tcp)
         return contact, peak
 
-    def _check_reached(self, step: JointMove | LinearMove, q: Array, T_base_tcp: Array) -> None:
+    def _check_reached(self, step: JointMove | LinearMove, q_end: Array, q: Array, T_base_tcp: Array) -> None:
         if isinstance(step, JointMove):
             off = float(np.abs(q - step.q).max())
             reached, missing = off <= _REACHED_RAD, f"{off:.3f} rad"
@@ -157,13 +169,19 @@ class Executor:
                 f"step {step.label!r} ended {missing} from its target: something stopped the arm; look at the cell, "
                 "then recover"
             )
+        away = np.abs(q - q_end)
+        if away.max() > _SAME_WAY_RAD:
+            raise GuardTripped(
+                f"step {step.label!r} ended with joint {int(away.argmax()) + 1} {away.max():.2f} rad from where the "
+                "checked path ends: the arm took another way; look at the cell, then recover"
+            )
 
-    def _grip(self, step: Grip) -> tuple[bool, float]:
+    def _grip(self, step: Grip, lowest_tip_m: float) -> tuple[bool, float]:
         """Move the fingers; whether they met more than they may press on, and their largest contact force [N].
 
         The arm stands, and is watched and kept awake all the same.
         """
-        arm, gripper, clock = self._cell.arm, self._cell.gripper, self._cell.clock
+        arm, gripper, clock = self._devices.arm, self._devices.gripper, self._devices.clock
         limit = step.contact_force_n
         wrench_before, width_before = arm.state().wrench, gripper.state().width_m
         peak = 0.0
@@ -173,23 +191,24 @@ class Executor:
         clock.sleep(PERIOD_S)
         while gripper.state().busy:
             state = arm.state()
-            self._guard.check(state, clock.now())
+            self._guard.check(state, clock.now(), lowest_tip_m)
             peak = max(peak, float(np.linalg.norm((state.wrench - wrench_before)[:3])))
             if limit is not None and peak > limit:
-                self._grip(Grip(f"open after {step.label!r}", width_before, step.force_n))
+                self._grip(Grip(f"open after {step.label!r}", width_before, step.force_n), lowest_tip_m)
                 return True, peak
             arm.kick()
             if clock.now() > deadline:
                 raise DeviceFault(
                     f"the gripper was still busy {_GRIP_TIMEOUT_S:.0f} s after {step.label!r}; "
-                    "power-cycle it at the Compute Box, then recover"
+                    "power-cycle it at the Compute Box, then recover",
+                    device="gripper",
                 )
             clock.sleep(PERIOD_S)
         return False, peak
 
     def _stop(self) -> None:
         """Stop arm and fingers and wait for standstill; an arm that is lost is stopped by its own controller."""
-        arm, gripper, clock = self._cell.arm, self._cell.gripper, self._cell.clock
+        arm, gripper, clock = self._devices.arm, self._devices.gripper, self._devices.clock
         # The arm first: a gripper that does not answer must not delay it.
         with suppress(CellError):
             arm.stop()

@@ -1,28 +1,25 @@
-"""The layer between every decision and every motion.
+"""The check of a whole plan before anything moves: the arm's path is sampled once, and the samples go with the plan.
 
-`check_config` refuses a cell that cannot work, `check_plan` refuses a whole plan before anything moves, and a `Guard`
-watches the arm while it moves. A violation latches: until an operator asks for `recover`, nothing moves. This layer
-adds to the safety settings of the controller and never replaces them.
+It adds to the safety settings of the controller and never replaces them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from robotcell.errors import ConfigError, DeviceFault, GuardTripped, UnsafeMotion
+from robotcell.config.surroundings import obstacles
+from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, rg2, ur5e
 from robotcell.geometry.transforms import Array, check_transform, interpolate_transforms, rotation_angle
-from robotcell.interfaces import ArmMode, ArmState
-from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan, flange_pose, tool_down
+from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.tool import flange_pose
 
 if TYPE_CHECKING:
-    from robotcell.cell import Latch
-    from robotcell.config.schema import CellConfig, KeepOut
+    from robotcell.config import CellConfig, KeepOut
 
 # Distance between the samples of a checked path. A joint step of 0.04 rad moves the outstretched tcp by 40 mm.
 _JOINT_STEP_RAD = 0.04
@@ -30,170 +27,81 @@ _LINEAR_STEP_M = 0.01
 _ROTATION_STEP_RAD = 0.05
 # Two neighbouring samples of a straight path whose joints differ by more lie across a singularity.
 _MAX_JOINT_JUMP_RAD = 0.35
-# The measured arm may be this far from where a plan starts (settled position error of a UR5e is far below it).
-_START_TOLERANCE_RAD = 0.02
 # Rounding of positions that lie on a limit.
 _ROUNDING_M = 1e-6
-# Measured speeds scatter about the commanded ones; a measured tcp overshoots its box by rounding and control error.
-_SPEED_SLACK = 1.05
-_BOX_SLACK_M = 0.005
-# A time stamp may be ahead of the clock by what two clocks of one machine can differ.
-_CLOCK_SLACK_S = 0.01
 # The base and the turning shoulder stand on the table, or in it where the table is higher than the arm's base.
 _STANDS_ON_TABLE = 2
 
 
 @dataclass(frozen=True)
 class CheckedPlan:
-    """A plan that `check_plan` found safe; the only thing that the executor accepts."""
+    """A plan that `check_path` found safe; the only thing that the executor accepts.
+
+    Attributes:
+        plan: as it was checked.
+        joint_paths: for each step the joint angles (N, 6) [rad] along it, from its start to its end; (1, 6) for a step
+            during which the arm stands.
+        lowest_tip_m: height above the table that the finger tips may go down to [m].
+    """
 
     plan: MotionPlan
+    joint_paths: tuple[Array, ...]
+    lowest_tip_m: float
 
 
-def check_config(config: CellConfig) -> None:
-    """Check that the parts of a configuration fit each other.
-
-    Raises:
-        ConfigError: naming everything that does not: speeds over their limits, a home pose that is unsafe or in the
-            view of the camera, a workspace or a bin that the arm may not or cannot reach.
-    """
-    problems: list[str] = []
-    motion, limits = config.motion, config.limits
-    if motion.joint_speed_rad_s > limits.joint_speed_rad_s:
-        problems.append(
-            f"motion.joint_speed_rad_s = {motion.joint_speed_rad_s}: above limits.joint_speed_rad_s = "
-            f"{limits.joint_speed_rad_s}"
-        )
-    for name in ("linear_speed_m_s", "guarded_speed_m_s"):
-        if getattr(motion, name) > limits.tool_speed_m_s:
-            problems.append(
-                f"motion.{name} = {getattr(motion, name)}: above limits.tool_speed_m_s = {limits.tool_speed_m_s}"
-            )
-    home = np.array(motion.home_q)
-    try:
-        _check_path(home[None], 0.0, bodies.obstacles(config), config, "motion.home_q")
-    except UnsafeMotion as error:
-        problems.append(str(error))
-    if bodies.blocks_view(home, config):
-        problems.append("motion.home_q: the arm would stand between the camera and the workspace")
-    z = config.table.height_m + motion.approach_m
-    corners = {f"workspace, corner x {x}, y {y}": (x, y) for x, y in product(config.workspace.x, config.workspace.y)}
-    for name, (x, y) in {**corners, "bin.center": config.bin.center}.items():
-        if _outside_box(np.array([[x, y, z]]), config, _ROUNDING_M)[0]:
-            problems.append(f"{name}: {1000 * motion.approach_m:.0f} mm above it the tcp would leave its limits")
-            continue
-        q = ur5e.inverse(flange_pose(tool_down(x, y, z, 0.0)), home)
-        if q is None:
-            problems.append(f"{name}: out of the arm's reach with the tool down")
-            continue
-        if motion.joint_speed_rad_s > limits.joint_speed_rad_s:
-            continue
-        way = JointMove(name, q, motion.joint_speed_rad_s, motion.joint_acceleration_rad_s2)
-        try:
-            _joint_path(home, way, config, f"the way from motion.home_q to {name}")
-        except UnsafeMotion as error:
-            problems.append(str(error))
-    if problems:
-        heading = f"the configuration does not fit together: {len(problems)} problem(s)"
-        raise ConfigError("\n  ".join([heading, *problems]))
-
-
-def check_plan(plan: MotionPlan, config: CellConfig) -> CheckedPlan:
+def check_path(plan: MotionPlan, config: CellConfig, *, lowest_tip_m: float | None = None) -> CheckedPlan:
     """Check every step of a plan against every limit, from the joint angles it starts at.
 
     Reach, joint limits, singularities on straight lines, speeds, the box of the tcp, keep-outs, the table, the arm
     itself and the gripper's range; with the load where one is held. Where the arm stands at the start is a fact, not a
     plan: only where it goes is checked, so that it can leave a place that it should not be in.
 
+    Args:
+        plan: to be checked.
+        config: of the cell, with its limits.
+        lowest_tip_m: height above the table that the finger tips may go down to [m], below it where negative;
+            gripper.tip_clearance_m of the cell unless given.
+
     Raises:
         UnsafeMotion: the first violation, with the step, the place and the limit.
     """
+    lowest = config.gripper.tip_clearance_m if lowest_tip_m is None else lowest_tip_m
     q = _joint_vector(plan.q_start, f"{plan.label}: start")
-    obstacles = bodies.obstacles(config)
+    boxes = obstacles(config)
+    paths: list[Array] = []
     for step in plan.steps:
         name = f"{plan.label}, step {step.label!r}"
+        path = q[None]
         if isinstance(step, Grip):
             _check_grip(step, name)
-        elif isinstance(step, JointMove):
-            path = _joint_path(q, step, config, name)
-            _check_path(path[1:], step.load_m, obstacles, config, name)
-            q = path[-1]
-        elif isinstance(step, LinearMove):
-            path = _linear_path(q, step, config, name)
-            _check_path(path[1:], step.load_m, obstacles, config, name)
-            q = path[-1]
+        elif isinstance(step, JointMove | LinearMove):
+            path = (
+                joint_path(q, step, config, name)
+                if isinstance(step, JointMove)
+                else _linear_path(q, step, config, name)
+            )
+            check_poses(path[1:], step.load_m, boxes, config, name, lowest)
         elif not isinstance(step, CheckHold):
             raise TypeError(f"{name}: {type(step).__name__} is no step of a plan")
-    return CheckedPlan(plan)
+        paths.append(path)
+        q = path[-1]
+    return CheckedPlan(plan, tuple(paths), lowest)
 
 
-class Guard:
-    """Watches the arm while it moves; what it finds is latched in the cell."""
+def outside_box(points: Array, config: CellConfig, slack_m: float, lowest_m: float) -> npt.NDArray[np.bool_]:
+    """Which points (N, 3) [m] of the base frame lie outside the box of the tcp (`limits`) by more than a slack.
 
-    def __init__(self, config: CellConfig, latch: Latch) -> None:
-        self._config = config
-        self._latch = latch
-
-    def check_start(self, state: ArmState, now: float, plan: MotionPlan) -> None:
-        """Before a plan runs: nothing latched, the arm within its limits, and standing where the plan starts.
-
-        Raises:
-            GuardTripped: a violation is latched, or the arm's state is stale or beyond a limit.
-            DeviceFault: the arm is not ready.
-            UnsafeMotion: the arm stands elsewhere.
-        """
-        self._latch.check()
-        self._check_state(state, now)
-        off = float(np.abs(state.q - plan.q_start).max())
-        if not off <= _START_TOLERANCE_RAD:
-            raise UnsafeMotion(
-                f"{plan.label}: a joint is {off:.3f} rad from the start of the plan: plan again from measured joints"
-            )
-
-    def check(self, state: ArmState, now: float) -> None:
-        """In every supervision period of a motion.
-
-        Raises:
-            GuardTripped: a limit is exceeded or the state is stale; latched.
-            DeviceFault: the controller stopped the arm; latched.
-        """
-        try:
-            self._check_state(state, now)
-            x, y, z = state.T_base_tcp[:3, 3]
-            if _outside_box(state.T_base_tcp[None, :3, 3], self._config, _BOX_SLACK_M)[0]:
-                raise _tripped(f"the tcp at x {x:.3f}, y {y:.3f}, z {z:.3f} m left its box")
-        except (DeviceFault, GuardTripped) as error:
-            self._latch.trip(str(error))
-            raise
-
-    def _check_state(self, state: ArmState, now: float) -> None:
-        """Freshness, mode, force and speeds; a number that is not one fails every comparison."""
-        limits = self._config.limits
-        if state.mode is not ArmMode.READY:
-            raise DeviceFault(f"the arm is in {state.mode.value}; clear the cause at the cell, then recover")
-        age = now - state.t
-        if not -_CLOCK_SLACK_S <= age <= limits.state_age_s:
-            raise _tripped(f"the arm's state is {age:.2f} s old (limit {limits.state_age_s} s)")
-        if not (np.isfinite(state.q).all() and np.isfinite(state.T_base_tcp).all()):
-            raise _tripped("the arm reports a position that is not a number")
-        force = float(np.linalg.norm(state.wrench[:3]))
-        joint_speed = float(np.abs(state.qd).max())
-        tool_speed = float(ur5e.tool_speed(state.q, state.qd, rg2.CLOSED_LENGTH_M))
-        for value, limit, what in (
-            (force, limits.force_n, "the tool feels {:.0f} N (limit {:.0f} N)"),
-            (
-                joint_speed,
-                _SPEED_SLACK * limits.joint_speed_rad_s,
-                "a joint turns at {:.2f} rad/s (limit {:.2f} rad/s)",
-            ),
-            (tool_speed, _SPEED_SLACK * limits.tool_speed_m_s, "the tool moves at {:.2f} m/s (limit {:.2f} m/s)"),
-        ):
-            if not value <= limit:
-                raise _tripped(what.format(value, limit))
-
-
-def _tripped(what: str) -> GuardTripped:
-    return GuardTripped(f"{what}; the arm is stopped: look at the cell, then recover")
+    Args:
+        points: of the tcp.
+        config: of the cell.
+        slack_m: distance that does not count.
+        lowest_m: height above the table that the tips may go down to; a lower one than the box's lets it reach so far.
+    """
+    limits = config.limits
+    low, high = np.array([limits.x, limits.y, limits.z]).T
+    low[2] = min(low[2], lowest_m)
+    relative = points - (0.0, 0.0, config.table.height_m)
+    return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))
 
 
 def _check_grip(step: Grip, name: str) -> None:
@@ -215,8 +123,12 @@ def _check_below(value: float, limit: float, what: str, unit: str, name: str) ->
         raise UnsafeMotion(f"{name}: {what} {value:.4g} {unit} is not within 0 and the limit of {limit:.4g} {unit}")
 
 
-def _joint_path(q: Array, step: JointMove, config: CellConfig, name: str) -> Array:
-    """Joint angles (N, 6) along a joint-space motion."""
+def joint_path(q: Array, step: JointMove, config: CellConfig, name: str) -> Array:
+    """Joint angles (N, 6) [rad] along a joint-space motion from q (6,).
+
+    Raises:
+        UnsafeMotion: speed or acceleration are over their limits, or the tool would move too fast.
+    """
     goal = _joint_vector(step.q, name)
     limits = config.limits
     _check_below(step.speed_rad_s, limits.joint_speed_rad_s, "joint speed", "rad/s", name)
@@ -273,25 +185,39 @@ def _linear_path(q: Array, step: LinearMove, config: CellConfig, name: str) -> A
     return path
 
 
-def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], config: CellConfig, name: str) -> None:
+def check_poses(
+    path: Array, load_m: float, boxes: tuple[KeepOut, ...], config: CellConfig, name: str, lowest_tip_m: float
+) -> None:
+    """Check joint angles (N, 6) [rad]: joint limits, the tips' height, the tcp's box, keep-outs, the arm itself.
+
+    Args:
+        path: to be checked.
+        load_m: how far a held object reaches below the tcp.
+        boxes: that nothing may enter.
+        config: of the cell.
+        name: of the motion, for the error.
+        lowest_tip_m: height above the table that the finger tips may go down to.
+
+    Raises:
+        UnsafeMotion: the first violation, with the place and the limit.
+    """
     limits, table = config.limits, config.table.height_m
     margin = ur5e.JOINT_LIMIT - limits.joint_margin_rad
     if (np.abs(path) > margin).any():
         joint = int((np.abs(path) - margin).max(axis=0).argmax())
         raise UnsafeMotion(
-            f"{name}: joint {joint} would turn to {path[np.abs(path[:, joint]).argmax(), joint]:.2f} rad "
+            f"{name}: joint {joint + 1} would turn to {path[np.abs(path[:, joint]).argmax(), joint]:.2f} rad "
             f"(limit +-{margin[joint]:.2f} rad)"
         )
     T_tcp = ur5e.forward(path) @ rg2.T_FLANGE_TCP
     tcp = T_tcp[:, :3, 3]
-    too_low = tcp[:, 2] < table + config.gripper.tip_clearance_m - _ROUNDING_M
+    too_low = tcp[:, 2] < table + lowest_tip_m - _ROUNDING_M
     if too_low.any():
         z = tcp[:, 2].min() - table
         raise UnsafeMotion(
-            f"{name}: the finger tips would be {1000 * z:.1f} mm above the table "
-            f"(limit {1000 * config.gripper.tip_clearance_m:.1f} mm)"
+            f"{name}: the finger tips would be {1000 * z:.1f} mm above the table (limit {1000 * lowest_tip_m:.1f} mm)"
         )
-    outside = _outside_box(tcp, config, slack_m=_ROUNDING_M)
+    outside = outside_box(tcp, config, _ROUNDING_M, lowest_tip_m)
     if outside.any():
         x, y, z = tcp[int(outside.argmax())]
         raise UnsafeMotion(
@@ -304,17 +230,10 @@ def _check_path(path: Array, load_m: float, obstacles: tuple[KeepOut, ...], conf
     if (centers[:, above, 2] - radius[above] < table).any():
         raise UnsafeMotion(f"{name}: the arm or the gripper's body would touch the table")
     points = bodies.finger_points(T_tcp, load_m)
-    for box in obstacles:
-        body = (bodies.box_distance(box, centers) < radius)[:, bodies.SPHERES.group > 0]
-        fingers = bodies.box_distance(box, points) < limits.clearance_m
+    for box in boxes:
+        body = (bodies.box_distance(*box.corners(), centers) < radius)[:, bodies.SPHERES.group > 0]
+        fingers = bodies.box_distance(*box.corners(), points) < limits.clearance_m
         if body.any() or fingers.any():
             raise UnsafeMotion(f"{name}: the arm, the gripper or its load would enter the keep-out {box.name!r}")
     if (bodies.self_distance(centers) < limits.clearance_m).any():
         raise UnsafeMotion(f"{name}: the arm or the gripper would touch the arm itself")
-
-
-def _outside_box(points: Array, config: CellConfig, slack_m: float) -> npt.NDArray[np.bool_]:
-    limits = config.limits
-    low, high = np.array([limits.x, limits.y, limits.z]).T
-    relative = points - (0.0, 0.0, config.table.height_m)
-    return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))

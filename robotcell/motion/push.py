@@ -6,13 +6,21 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from robotcell.errors import UnsafeMotion
+from robotcell.geometry import rg2, ur5e
+from robotcell.motion.plan import Grip, MotionPlan, Step, guarded_move, home_move, joint_move, linear_move
 from robotcell.motion.rotations import rotation_angle_rad
+from robotcell.motion.tool import near_height, solve_tool_down, tool_down
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import Workspace
+    from robotcell.config import CellConfig, Workspace
+    from robotcell.geometry.transforms import Array
+    from robotcell.perception.heightmap import Heightmap
 
 # A direction whose component along a side of the workspace is smaller never crosses the other one.
 _PARALLEL = 1e-9
+# A push shorter than this, after it was cut off at the rim of the workspace, moves nothing.
+_MIN_PUSH_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -64,3 +72,40 @@ def push_in_workspace(
             length_m = min(length_m, ((high if d > 0 else low) - v) / d)
     end = (x + length_m * direction[0], y + length_m * direction[1])
     return Push((x, y), end, rotation, top_m, q_value)
+
+
+def push_height(top_m: float, config: CellConfig) -> float:
+    """Height of the tcp above the table [m] for a push of what is that high: half of it (paper)."""
+    return max(top_m / 2, config.gripper.tip_clearance_m)
+
+
+def plan_push(push: Push, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
+    """The motion of a push, from `q_start` (6,) [rad] back to the home pose.
+
+    Raises:
+        UnsafeMotion: a pose is out of reach, or the push is too short to move anything.
+    """
+    (x, y), (end_x, end_y) = push.start, push.end
+    if push.length_m < _MIN_PUSH_M:
+        raise UnsafeMotion(
+            f"push at x {x:.3f}, y {y:.3f} m: less than {1000 * _MIN_PUSH_M:.0f} mm of it is inside the workspace"
+        )
+    tcp_z = config.table.height_m + push_height(push.top_m, config)
+    approach_z = tcp_z + config.motion.approach_m
+    q_above = solve_tool_down("approach", tool_down(x, y, approach_z, push.theta), config)
+    T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
+    T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
+    T_near[2, 3] = near_height(heightmap, x, y, push.theta, rg2.MIN_WIDTH_M, tcp_z, config)
+    T_start[2, 3] = tcp_z
+    T_end[:3, 3] = (end_x, end_y, tcp_z)
+    T_up[:3, 3] = (end_x, end_y, approach_z)
+    steps: tuple[Step, ...] = (
+        Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
+        joint_move("approach", q_above, config),
+        linear_move("descend", T_near, config),
+        guarded_move("descend guarded", T_start, config),
+        guarded_move("push", T_end, config),
+        linear_move("lift", T_up, config),
+        home_move(config),
+    )
+    return MotionPlan("push", q_start, steps)

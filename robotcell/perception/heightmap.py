@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robotcell.geometry.transforms import Array, check_transform, invert_transform, transform_points
+from robotcell.perception.calibrated_camera import CalibratedCamera
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
+    from robotcell.config.calibration_file import CameraModel
+    from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Intrinsics, RgbdFrame
 
 # Returns outside this band above the table [m] are not of things that lie on it: the arm, a lamp, reflections
@@ -127,7 +129,7 @@ def upper_height(height_m: npt.NDArray[np.float32], percent: int) -> float:
 
 def build_heightmap(
     frame: RgbdFrame,
-    T_base_camera: Array,
+    camera: CalibratedCamera,
     workspace: Workspace,
     table_height_m: float,
     masks: Mapping[str, npt.NDArray[np.bool_]] | None = None,
@@ -139,13 +141,14 @@ def build_heightmap(
 
     Args:
         frame: colour and registered depth.
-        T_base_camera: pose of the colour optical frame in the base frame.
+        camera: that took it, as its calibration has it.
         workspace: the rectangle of the base frame that the map covers.
         table_height_m: z of the table in the base frame.
         masks: (Himg, Wimg) bool images by name that are carried along.
 
     Raises:
-        ValueError: the transform is not rigid, or an image does not have the size that the intrinsics say.
+        ValueError: an image does not have the size that the intrinsics say.
+        CalibrationError: the frame is of another resolution than the calibration.
     """
     size = (frame.intrinsics.height, frame.intrinsics.width)
     masks = masks or {}
@@ -153,11 +156,10 @@ def build_heightmap(
     for name, image in images.items():
         if image.shape[:2] != size:
             raise ValueError(f"image {name!r} is {image.shape[:2]}; the intrinsics say {size} (height, width)")
-    pose = check_transform(T_base_camera, "T_base_camera")
-    view = _view(frame.intrinsics, pose.tobytes(), workspace, table_height_m)
+    view = _view(frame.intrinsics, camera.T_base_camera.tobytes(), camera.model, workspace, table_height_m)
     rows, cols = workspace.shape
 
-    depth = frame.depth_m[view.crop]
+    depth = camera.depth_m(frame)[view.crop]
     with np.errstate(invalid="ignore", over="ignore"):
         col = depth * view.rays[0] + view.origin[0]
         row = depth * view.rays[1] + view.origin[1]
@@ -207,30 +209,28 @@ class _View(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _view(intrinsics: Intrinsics, pose: bytes, workspace: Workspace, table_height_m: float) -> _View:
-    T_base_camera = np.frombuffer(pose).reshape(4, 4)
-    crop = _crop(intrinsics, T_base_camera, workspace, table_height_m)
-    v, u = np.mgrid[crop].astype(np.float64)
-    directions = np.stack([(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, np.ones_like(u)])
+def _view(
+    intrinsics: Intrinsics, pose: bytes, model: CameraModel | None, workspace: Workspace, table_height_m: float
+) -> _View:
+    camera = CalibratedCamera(np.frombuffer(pose).reshape(4, 4), model)
+    crop = _crop(intrinsics, camera, workspace, table_height_m)
     scale = np.array([1 / workspace.resolution_m, 1 / workspace.resolution_m, 1.0])
-    rays = np.einsum("ij,jvu->ivu", scale[:, None] * T_base_camera[:3, :3], directions)
-    origin = scale * (T_base_camera[:3, 3] - (workspace.x[0], workspace.y[0], table_height_m))
+    rays = scale[:, None, None] * camera.rays(intrinsics, crop)
+    origin = scale * (camera.position - (workspace.x[0], workspace.y[0], table_height_m))
     return _View(crop, rays.astype(np.float32), origin.astype(np.float32))
 
 
 def _crop(
-    intrinsics: Intrinsics, T_base_camera: Array, workspace: Workspace, table_height_m: float
+    intrinsics: Intrinsics, camera: CalibratedCamera, workspace: Workspace, table_height_m: float
 ) -> tuple[slice, slice]:
     """Rows and columns of the image that can see into the workspace's box."""
     rows, cols = workspace.shape
     x = (workspace.x[0], workspace.x[0] + cols * workspace.resolution_m)
     y = (workspace.y[0], workspace.y[0] + rows * workspace.resolution_m)
     z = (table_height_m + BAND_M[0], table_height_m + BAND_M[1])
-    corners = transform_points(invert_transform(T_base_camera), np.array(list(product(x, y, z))))
-    if corners[:, 2].min() <= 1e-3:
+    u, v, depth = camera.project(np.array(list(product(x, y, z))), intrinsics).T
+    if depth.min() <= 1e-3:
         return slice(0, intrinsics.height), slice(0, intrinsics.width)  # the box reaches behind the camera
-    u = intrinsics.fx * corners[:, 0] / corners[:, 2] + intrinsics.cx
-    v = intrinsics.fy * corners[:, 1] / corners[:, 2] + intrinsics.cy
     return _span(v, intrinsics.height), _span(u, intrinsics.width)
 
 

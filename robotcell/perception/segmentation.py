@@ -1,20 +1,16 @@
-"""Which objects lie on the table: object mask, instances, and the goal among them."""
+"""Which objects lie on the table: object mask and instances."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import find_objects
-from scipy.spatial.distance import cdist
 
-from robotcell.errors import ConfigError, NoTarget
-from robotcell.perception.colors import PALETTE
+from robotcell.perception.colors import PALETTE, color_features, palette_distances
 from robotcell.perception.heightmap import upper_height
 
 if TYPE_CHECKING:
@@ -38,12 +34,6 @@ _STEP_M = 0.012
 # A neck narrower than this share of the narrower of the two parts that it joins separates equal colours.
 _NECK = 0.5
 
-# Colours are compared by CIELAB a and b as they would be at this lightness, which a shadow or an exposure
-# does not change (scaling the light scales a, b and L + 16 alike), and by lightness with less weight. In 4000
-# draws a weight of 0.2 to 0.4 named every colour right under 6 % of drift per channel and shading to 60 %.
-# The table is no reference for the white balance, since a real one need not be neutral.
-_LIGHTNESS = 66.0
-_LIGHTNESS_WEIGHT = 0.3
 # Cells of an instance that its median colour is taken of.
 _MEDIAN_CELLS = 300
 # Colour distances beyond this are all the same: one odd cell must not outvote its surroundings.
@@ -115,58 +105,13 @@ def segment(heightmap: Heightmap) -> Segmentation:
     return _describe(labels, heightmap)
 
 
-def check_goal_word(word: str) -> str:
-    """`word` if it names a colour of the palette.
-
-    Raises:
-        ConfigError: it does not; the message lists the palette.
-    """
-    if word not in PALETTE:
-        raise ConfigError(f"goal {word!r} is not a colour that is known; known are: {', '.join(PALETTE)}")
-    return word
-
-
-def find_goal(segmentation: Segmentation, color: str) -> Instance:
-    """The most visible object of a colour.
-
-    Raises:
-        ConfigError: the colour is not in the palette.
-        NoTarget: no object on the table has it; the message lists those that are there.
-    """
-    check_goal_word(color)
-    for instance in segmentation.instances:
-        if instance.color_name == color:
-            return instance
-    there = Counter(instance.color_name for instance in segmentation.instances)
-    listing = ", ".join(name if n == 1 else f"{name} ({n})" for name, n in sorted(there.items()))
-    raise NoTarget(f"no {color} object is seen on the table; there is: {listing or 'nothing'}")
-
-
-def _features(colors: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-    """(N, 3) perceptual coordinates of (N, 3) RGB colours, N > 0."""
-    lab = cv2.cvtColor(colors[None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)[0]
-    lightness = lab[:, 0]
-    at_equal_light = lab[:, 1:] * ((_LIGHTNESS + 16) / (lightness[:, None] + 16))
-    return np.column_stack([at_equal_light, _LIGHTNESS_WEIGHT * lightness])
-
-
-@lru_cache(maxsize=1)
-def _palette_features() -> npt.NDArray[np.float32]:
-    return _features(np.array(list(PALETTE.values()), np.uint8))
-
-
-def _distances(features: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """(colours, N) distances of the palette to (N, 3) features."""
-    return np.asarray(cdist(_palette_features(), features), np.float32)
-
-
 def _colors(heightmap: Heightmap, objects: npt.NDArray[np.bool_]) -> npt.NDArray[np.int32]:
     """(H, W) index of the palette colour that fits each object cell and its surroundings best."""
     known = objects & np.isfinite(heightmap.height_m)
-    features = _features(heightmap.color[known])
+    features = color_features(heightmap.color[known])
     planes = np.zeros((len(PALETTE), *objects.shape), np.float32)
     # Negative: cells without an object weigh nothing, and the largest sum wins.
-    planes[:, known] = np.minimum(_distances(features), _FAR) - _FAR
+    planes[:, known] = np.minimum(palette_distances(features), _FAR) - _FAR
     width = _cells(_SMOOTHING_M, heightmap.workspace.resolution_m) | 1
     for plane in planes:
         cv2.boxFilter(plane, -1, (width, width), dst=plane, borderType=cv2.BORDER_CONSTANT)
@@ -309,8 +254,8 @@ def _names(colors: list[npt.NDArray[np.uint8]]) -> list[str]:
     if not colors:
         return []
     samples = [cells[:: max(1, len(cells) // _MEDIAN_CELLS)] for cells in colors]
-    features = np.split(_features(np.concatenate(samples)), np.cumsum([len(sample) for sample in samples])[:-1])
-    nearest = _distances(np.array([np.median(of_one, axis=0) for of_one in features])).argmin(axis=0)
+    features = np.split(color_features(np.concatenate(samples)), np.cumsum([len(sample) for sample in samples])[:-1])
+    nearest = palette_distances(np.array([np.median(of_one, axis=0) for of_one in features])).argmin(axis=0)
     return [list(PALETTE)[i] for i in nearest]
 
 

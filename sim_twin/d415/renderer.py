@@ -18,7 +18,7 @@ from sim_twin.options import DepthError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.geometry.transforms import Array
     from sim_twin.options import TwinOptions
     from sim_twin.visual import Visual

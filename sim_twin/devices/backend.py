@@ -5,12 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from robotcell.cell import Cell
+from robotcell.interfaces import Devices
 from sim_twin.options import TwinOptions
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.scenes.scene import Scene
     from sim_twin.world.world import World
 
@@ -21,9 +22,9 @@ class TwinBackend:
     Options: type[BaseModel] = TwinOptions
 
     @staticmethod
-    def open(config: CellConfig) -> Cell:
-        """The twin of a configuration, not yet connected."""
-        return open_twin(config)[0]
+    def open(config: CellConfig) -> Devices:
+        """The twin's devices, not yet connected."""
+        return open_twin(config)[0].devices
 
 
 def open_twin(config: CellConfig, scene: Scene | None = None) -> tuple[Cell, World]:
@@ -42,4 +43,5 @@ def open_twin(config: CellConfig, scene: Scene | None = None) -> tuple[Cell, Wor
     options = TwinOptions.model_validate(config.backend.options)
     world = World(config, options, scene=scene)
     camera = TwinCamera(world, config.camera, options)
-    return Cell(config, TwinArm(world), TwinGripper(world), camera, TwinClock(world)), world
+    devices = Devices(TwinArm(world), TwinGripper(world), camera, TwinClock(world))
+    return Cell(config, devices), world

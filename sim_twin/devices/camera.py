@@ -13,7 +13,7 @@ from sim_twin.d415.renderer import FRAMES_PER_S, SERIAL, Floats, Renderer
 from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from sim_twin.d415.rays import Indices
     from sim_twin.options import TwinOptions
     from sim_twin.world.world import World

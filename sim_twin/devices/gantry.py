@@ -16,7 +16,7 @@ import numpy as np
 from robotcell.geometry import rg2
 from robotcell.geometry.transforms import invert_transform
 from robotcell.motion.executor import Ending
-from robotcell.motion.plan import tool_down
+from robotcell.motion.tool import tool_down
 from sim_twin.devices.gripper import TwinGripper
 from sim_twin.devices.trajectory import trapezoid
 from sim_twin.world import robot_model
@@ -28,7 +28,7 @@ from sim_twin.world.world import World
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
     from sim_twin.options import TwinOptions
     from sim_twin.scenes.scene import Scene

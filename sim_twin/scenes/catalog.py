@@ -23,7 +23,7 @@ from sim_twin.scenes.shapes import BLOCK_NAMES, block
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
     from robotcell.geometry.transforms import Array
     from sim_twin.scenes.shapes import Shape
 

@@ -10,7 +10,7 @@ import numpy as np
 from robotcell.geometry.transforms import make_transform
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import Workspace
+    from robotcell.config import Workspace
     from robotcell.geometry.transforms import Array
     from sim_twin.scenes.shapes import Shape
 

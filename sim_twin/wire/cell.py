@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
     from typing_extensions import Self
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 # Ten objects are built in half a second; a busy machine may need many times that to import everything.
 _START_S = 90.0

@@ -22,7 +22,7 @@ from sim_twin.world.world import World
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
 
 # A controller whose tick stands still for this long is dead: the brakes fall in.

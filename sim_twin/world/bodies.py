@@ -19,7 +19,7 @@ from sim_twin.world.furniture import furniture
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.scenes.meshes import Mesh
     from sim_twin.scenes.shapes import Shape
     from sim_twin.world.robot_model import Machine

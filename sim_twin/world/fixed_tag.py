@@ -11,7 +11,7 @@ from robotcell.perception.tags import FAMILY
 from sim_twin.visual import Visual
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 TAG_ID = 7
 _SIDE_M = 0.060

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from robotcell.geometry.bodies import camera_post
+from robotcell.config.surroundings import camera_post
 from robotcell.geometry.transforms import make_transform
 from sim_twin.world.robot_model import Part, Vector
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
 
 FurnitureKind = Literal["table", "bin", "post"]

@@ -11,7 +11,7 @@ from robotcell.errors import ConfigError
 from sim_twin.world.bodies import is_at_rest, load_object, object_pose, put_body, put_to_sleep, wake
 
 if TYPE_CHECKING:
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.scenes.scene import Scene
     from sim_twin.world.bodies import Friction
     from sim_twin.world.simulation import Simulation

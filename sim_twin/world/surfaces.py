@@ -14,7 +14,7 @@ from sim_twin.world.furniture import furniture
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
     from sim_twin.options import TwinOptions
     from sim_twin.scenes.scene import SceneObject

@@ -25,7 +25,7 @@ from sim_twin.world.surfaces import carrier_poses, fixed_surfaces, object_surfac
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
     from sim_twin.options import TwinOptions
     from sim_twin.scenes.scene import Scene, SceneObject

@@ -31,7 +31,7 @@ from calibration.collect.session import read_session
 from calibration.solve.rigid import change, difference
 from calibration.solve.solver import solve
 from calibration.target.board import DEFAULT_BOARD, held_by_gripper
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import CellError
 from sim_twin.devices.backend import open_twin
 from sim_twin.options import TwinOptions

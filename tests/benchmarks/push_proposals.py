@@ -26,11 +26,12 @@ from policy.push.outcome import Foresight
 from policy.push.value import Prospects
 from policy.training.environment import PushGraspEnv
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
-from robotcell.jobs.job import look
-from robotcell.jobs.policy_api import ROTATIONS
+from robotcell.config import load_config
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.perception.goals import find_goal
 from robotcell.perception.heightmap import Heightmap
-from robotcell.perception.segmentation import find_goal, segment
+from robotcell.perception.segmentation import segment
+from robotcell.perception.view import look
 from sim_twin.scenes.catalog import scene_names
 
 KINDS = ("enclosed", "packed")

@@ -25,9 +25,10 @@ from policy.push.outcome import Foresight
 from policy.push.value import Prospects
 from policy.training.environment import Outcome, PushGraspEnv
 from policy.training.learner import auc
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import NoTarget
-from robotcell.jobs.policy_api import ROTATIONS, Observation
+from robotcell.jobs.policy_api import Observation
+from robotcell.motion.rotations import ROTATIONS
 
 KINDS = ("enclosed", "packed")
 SCENES = 30

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from sim_twin.d415.renderer import MODES, Renderer

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import psutil
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.geometry import rg2, ur5e

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from robotcell.config.schema import CameraMount
+from robotcell.config import CameraMount
 from sim_twin.d415.noise import degrade_color, degrade_depth
 from sim_twin.d415.rays import RayCaster
 from sim_twin.d415.renderer import MODES

@@ -9,12 +9,12 @@ import pytest
 
 from policy import make_policy
 from robotcell.cell import Cell, open_cell
-from robotcell.config.schema import load_config
-from robotcell.jobs.job import View, look
+from robotcell.config import load_config
 from robotcell.jobs.policy_api import Action, Observation, Primitive
 from robotcell.motion.executor import Executor
-from robotcell.motion.path_check import CheckedPlan, check_plan
+from robotcell.motion.path_check import CheckedPlan, check_path
 from robotcell.motion.plan import plan_action
+from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,7 +46,7 @@ class Bench:
 
     def plan(self, view: View, action: Action) -> CheckedPlan:
         plan = plan_action(action, view.heightmap, self.cell.arm.state().q, self.cell.config)
-        return check_plan(plan, self.cell.config)
+        return check_path(plan, self.cell.config)
 
     def run(self, checked: CheckedPlan) -> None:
         Executor(self.cell).run(checked)

@@ -25,11 +25,12 @@ from policy.push.line import free_to_descend, push_line
 from policy.push.outcome import Foresight
 from policy.push.value import Prospects
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import Observation, Primitive
+from robotcell.perception.goals import find_goal
 from robotcell.perception.heightmap import build_heightmap, close_gaps
-from robotcell.perception.segmentation import find_goal, segment
+from robotcell.perception.segmentation import segment
 
 OBJECTS = 30
 ROUNDS = 20

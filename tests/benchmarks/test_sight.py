@@ -10,10 +10,11 @@ import pytest
 from policy import make_policy
 from policy.shadows import estimate_surface
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.jobs.policy_api import Observation
+from robotcell.perception.goals import find_goal
 from robotcell.perception.heightmap import build_heightmap
-from robotcell.perception.segmentation import find_goal, segment
+from robotcell.perception.segmentation import segment
 
 OBJECTS = 30
 RESOLUTIONS = pytest.mark.parametrize("resolution", ["640x480", "1280x720"], scope="module")

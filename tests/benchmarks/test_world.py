@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from sim_twin.devices.backend import open_twin
 
 COUNTS = pytest.mark.parametrize("count", [10, 30])

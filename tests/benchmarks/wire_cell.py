@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.ur5e.rtde import as_number, open_rtde
 from robotcell.errors import CellError
 from sim_twin.wire.cell import ServedCell

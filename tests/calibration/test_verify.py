@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from calibration.verify import Touch, Verification, choose_spots, go_home, touch_table
-from robotcell.config.schema import CellConfig, load_config
+from robotcell.config import CellConfig, load_config
 from robotcell.errors import CalibrationError
 from robotcell.perception.heightmap import TablePlane
 from sim_twin.devices.backend import open_twin

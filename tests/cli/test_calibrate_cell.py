@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from calibration.solve.rigid import difference
 from cli.main import app
+from robotcell.config import load_config
 from robotcell.config.calibration_file import load_calibration
-from robotcell.config.schema import load_config
 from sim_twin.options import TwinOptions
 
 OFFSET = [0.009, -0.007, 0.006, 0.006, -0.008, 0.010]

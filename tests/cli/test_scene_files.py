@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from cli.main import app
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.geometry.transforms import transform_points
 from robotcell.perception.colors import PALETTE
 from sim_twin.devices.backend import open_twin

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from sim_twin.wire.cell import ServedCell
 
 if TYPE_CHECKING:

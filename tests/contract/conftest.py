@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from robotcell.cell import Cell
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 TWIN = {"backend.name": "twin", "backend.options.objects": 1}
 HOST, MODBUS_PORT, CAMERA_PORT = "127.0.0.42", 15042, 30442

@@ -12,7 +12,7 @@ from robotcell.errors import ConnectionLost
 
 if TYPE_CHECKING:
     from robotcell.cell import Cell
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
 
 
 def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from policy import make_policy
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError
 from robotcell.jobs.policy_api import Observation, Primitive
 from tests.robotcell.maps import heightmap

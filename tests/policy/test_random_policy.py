@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from policy import make_policy
-from robotcell.config.schema import CellConfig, Table, Workspace
+from robotcell.config import CellConfig, Table, Workspace
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import Observation, Primitive
 from tests.robotcell.maps import heightmap

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.config.schema import Workspace
-from robotcell.jobs.policy_api import ROTATIONS, Action, Primitive
+from robotcell.config import Workspace
+from robotcell.motion.rotations import ROTATIONS
+from robotcell.jobs.policy_api import Action, Primitive
 from robotcell.perception.heightmap import Heightmap, TablePlane
 
 if TYPE_CHECKING:

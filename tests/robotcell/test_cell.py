@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from robotcell.cell import Cell
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
 
 

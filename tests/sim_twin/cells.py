@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, make_transform
 from sim_twin.devices import backend

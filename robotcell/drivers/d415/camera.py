@@ -28,7 +28,7 @@ from robotcell.interfaces import Camera, RgbdFrame
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from robotcell.config.schema import CameraMount
+    from robotcell.config import CameraMount
     from robotcell.interfaces import Clock
 
 FRAMES_PER_S = 30

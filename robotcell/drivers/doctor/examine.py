@@ -33,7 +33,7 @@ from robotcell.geometry.transforms import matrix_to_rotvec
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from robotcell.config.schema import CameraMount, CellConfig
+    from robotcell.config import CameraMount, CellConfig
     from robotcell.drivers.d415.camera import D415Options
     from robotcell.drivers.rg2 import RG2Options
     from robotcell.drivers.ur5e.arm import UR5eOptions

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from io import BufferedRandom
     from pathlib import Path
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from robotcell.interfaces import RgbdFrame
 
 # librealsense knows its recordings by it.

@@ -28,7 +28,7 @@ from sim_twin.wire.shared_state import Record, poses_dtype
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.visual import Visual
 
 WRONG_SERIAL = "999999999999"

@@ -17,11 +17,11 @@ from calibration.collect.session import load_records, read_session
 from calibration.solve.rigid import difference
 from calibration.target.board import DEFAULT_BOARD, held_by_gripper
 from calibration.target.detection import Detector
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError, DeviceFault, GuardTripped
 from robotcell.interfaces import Intrinsics, RgbdFrame
 from robotcell.motion.executor import Executor
-from robotcell.motion.path_check import check_plan
+from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import JointMove, MotionPlan
 from sim_twin.devices.backend import open_twin
 from sim_twin.options import TwinOptions
@@ -82,7 +82,7 @@ def collected(tmp_path_factory):
         collect_by_hand(cell, folder, DEFAULT_BOARD, 9, lambda: next(answers), told["by hand"])
         # At home the board hangs on edge before the camera: of no use, and not a view.
         home = MotionPlan("home", cell.arm.state().q, (JointMove("home", q_first, 1.0, 1.4),))
-        Executor(cell).run(check_plan(home, CONFIG))
+        Executor(cell).run(check_path(home, CONFIG))
         collect_by_hand(cell, folder, DEFAULT_BOARD, 9, lambda: next(answers), told["by hand"])
         cell.latch.trip("a hand in the cell")
         told["latched"] = Follower()

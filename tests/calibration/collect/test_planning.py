@@ -4,12 +4,12 @@ import pytest
 from calibration.collect.planning import HeldBoard, plan_views, plan_ways, visible
 from calibration.solve.verdict import MIN_ROTATION_DEG, rotation_spread_deg
 from calibration.target.board import DEFAULT_BOARD, held_by_gripper
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import ur5e
 from robotcell.geometry.transforms import invert_transform, transform_points
-from robotcell.motion.path_check import check_plan
-from robotcell.motion.plan import TALLEST_OBJECT_M
+from robotcell.motion.path_check import check_path
+from robotcell.motion.tool import TALLEST_OBJECT_M
 from sim_twin.d415.renderer import MODES
 
 CONFIG = load_config(None, {"camera.resolution": "1280x720"})
@@ -50,7 +50,7 @@ def test_every_way_is_safe_and_keeps_the_board_over_what_may_stand_on_the_table(
     q = HOME
     for target in views.views:
         for way in plan_ways("way", q, target, views.hub, HELD, CONFIG):
-            check_plan(way.plan, CONFIG)
+            check_path(way.plan, CONFIG)
             goal = way.plan.steps[-1].q
             for share in np.linspace(0, 1, 12):
                 T = ur5e.forward(way.plan.q_start + share * (goal - way.plan.q_start))

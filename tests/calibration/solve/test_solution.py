@@ -11,7 +11,7 @@ import pytest
 from calibration.solve.solution import save_if_better
 from calibration.solve.solver import solve
 from robotcell.config.calibration_file import load_calibration
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import CalibrationError, ConfigError
 from tests.calibration.synthetic import as_poses, make_views
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from policy.evaluation.benchmark import Origin, Settings
 from policy.evaluation.trials import TrialResult
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 
 ORIGIN = Origin("2026-01-01T00:00:00+00:00", {"robotcell": "0.1.0"})
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from policy.evaluation.benchmark import finished, load, plan, run, start, write_json
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError
 from tests.policy.evaluation.examples import ORIGIN, settings
 from tests.policy.evaluation.test_suites import toml

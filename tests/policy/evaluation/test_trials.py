@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from cli.main import app
 from policy.evaluation.suites import SUITES, Case
 from policy.evaluation.trials import Trial, run_trial
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from tests.policy.evaluation.test_suites import toml
 
 

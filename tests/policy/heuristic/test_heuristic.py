@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from policy import make_policy
 from policy.heuristic.policy import CLEAR_GRASP
-from robotcell.config.schema import CameraMount, CellConfig, Workspace
+from robotcell.config import CameraMount, CellConfig, Workspace
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.geometry import rg2
 from robotcell.jobs.policy_api import Observation, Primitive

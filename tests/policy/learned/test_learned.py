@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from policy.learned.policy import LearnedPolicy
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.jobs.policy_api import Observation, Primitive
 from tests.robotcell.maps import heightmap

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from policy.learned.selection import best_cells, check_maps, middles, possible_pushes, push_mask, pushes, surface_at
 from policy.push.line import free_to_descend
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
 
 

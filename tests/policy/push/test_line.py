@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from policy.push.line import free_to_descend, push_line
-from robotcell.config.schema import Workspace
+from robotcell.config import Workspace
 
 WORKSPACE = Workspace()
 RESOLUTION = WORKSPACE.resolution_m

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from policy.push.line import free_to_descend, push_line
 from policy.push.outcome import Foresight
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()

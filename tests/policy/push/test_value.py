@@ -9,7 +9,7 @@ from policy.grasp_room import Jaw
 from policy.network.q_network import GRASP
 from policy.push.outcome import Foresight, Played
 from policy.push.value import Prospects
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
 from tests.robotcell.maps import heightmap
 

@@ -14,7 +14,7 @@ from policy.training.environment import (
     PushGraspEnv,
     border_occupancy,
 )
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 
 SEED = 1_500_000
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from policy.training.environment import PushGraspEnv
 from policy.training.scenes import training_scene
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 
 
 def footprint(item):

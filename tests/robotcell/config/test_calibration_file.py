@@ -18,7 +18,7 @@ from robotcell.config.calibration_file import (
     load_calibration,
     save_calibration,
 )
-from robotcell.config.schema import CameraMount, load_config
+from robotcell.config import CameraMount, load_config
 from robotcell.errors import CalibrationError, ConfigError
 from robotcell.geometry.transforms import look_at, make_transform
 

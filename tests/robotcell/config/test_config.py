@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robotcell.cell import open_cell
-from robotcell.config.schema import CellConfig, Workspace, load_config
+from robotcell.config import CellConfig, Workspace, load_config
 from robotcell.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "cell.toml"

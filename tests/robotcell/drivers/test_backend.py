@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from robotcell.cell import open_cell
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.errors import ConfigError, ConnectionLost
 
@@ -45,7 +45,7 @@ def test_neither_the_command_nor_a_cell_that_is_not_connected_loads_a_vendors_li
         "import sys, cli.main, cli.doctor, robotcell.drivers.backend\n"
         "from pathlib import Path\n"
         "from robotcell.cell import open_cell\n"
-        "from robotcell.config.schema import load_config\n"
+        "from robotcell.config import load_config\n"
         f"open_cell(load_config(Path({str(EXAMPLES / 'hardware.toml')!r})))\n"
         "vendors = {'rtde_control', 'rtde_receive', 'pymodbus', 'pyrealsense2', 'pybullet'}\n"
         "sys.exit(', '.join(vendors & set(sys.modules)) or 0)\n"

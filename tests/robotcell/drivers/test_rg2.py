@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 from pymodbus.client import ModbusTcpClient
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion

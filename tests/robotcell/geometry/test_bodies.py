@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotcell.config.schema import CellConfig, KeepOut
+from robotcell.config import CellConfig, KeepOut
 from robotcell.geometry import bodies, ur5e
 
 BOX = KeepOut(name="box", x=(-1, 1), y=(0, 2), z=(0, 0.5))

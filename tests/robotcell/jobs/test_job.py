@@ -10,16 +10,19 @@ import pytest
 
 from policy import make_policy
 from robotcell.cell import Cell, open_cell
-from robotcell.config.schema import CellConfig, load_config
+from robotcell.config import CellConfig, load_config
 from robotcell.errors import CalibrationError, DeviceFault, GuardTripped, NoTarget
 from robotcell.jobs import job as jobs
-from robotcell.jobs.job import Decision, Outcome, Report, Result, View, judge, look, run_job
+from robotcell.jobs.job import Decision, Report, run_job
+from robotcell.jobs.verdict import Outcome, Result, judge
+from robotcell.perception.view import View, look
 from robotcell.jobs.journal import Journal
 from robotcell.jobs.policy_api import Action, Observation, Primitive
 from robotcell.motion.executor import Ending, Execution, Executor
-from robotcell.motion.path_check import CheckedPlan, check_plan
+from robotcell.motion.path_check import CheckedPlan, check_path
 from robotcell.motion.plan import plan_action
-from robotcell.perception.segmentation import Instance, Segmentation, find_goal
+from robotcell.perception.segmentation import Instance, Segmentation
+from robotcell.perception.goals import find_goal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -304,7 +307,7 @@ def grasp_plan(cell: Cell) -> CheckedPlan:
     view = look(cell)
     action = grasp_at(*RED)(Observation(view.heightmap, view.segmentation.labels, None, (), True))
     plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
-    return check_plan(plan, cell.config)
+    return check_path(plan, cell.config)
 
 
 def interrupt(monkeypatch: pytest.MonkeyPatch, device: object, method: str, call: int) -> None:

@@ -8,14 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotcell.cell import Latch
-from robotcell.config.schema import CellConfig
+from robotcell.motion.guard import Latch
+from robotcell.config import CellConfig
 from robotcell.errors import ConfigError, DeviceFault, GuardTripped, UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.interfaces import ArmMode, ArmState
 from robotcell.jobs.policy_api import Primitive
-from robotcell.motion.path_check import Guard, check_config, check_plan
-from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, plan_action, plan_retreat, tool_down
+from robotcell.motion.guard import Guard
+from robotcell.motion.config_check import check_config
+from robotcell.motion.path_check import check_path
+from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, plan_action
+from robotcell.motion.retreat import plan_retreat
+from robotcell.motion.tool import tool_down
 from tests.robotcell.maps import action, heightmap
 
 CONFIG = CellConfig()
@@ -69,7 +73,7 @@ def test_every_action_in_the_workspace_has_a_safe_plan(
         assert primitive is Primitive.PUSH
         assert "inside the workspace" in str(error)
         return
-    assert check_plan(plan, CONFIG).plan is plan
+    assert check_path(plan, CONFIG).plan is plan
 
 
 @pytest.mark.parametrize("x", [*CONFIG.workspace.x, -0.5])
@@ -77,7 +81,7 @@ def test_every_action_in_the_workspace_has_a_safe_plan(
 @pytest.mark.parametrize("z", [0.0, 0.03, 0.1])
 def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z: float) -> None:
     for rotation in range(16):
-        check_plan(plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG), CONFIG)
+        check_path(plan_action(action(Primitive.GRASP, x, y, z, rotation), heightmap(), HOME, CONFIG), CONFIG)
 
 
 @pytest.mark.parametrize(
@@ -96,30 +100,30 @@ def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z
 )
 def test_a_step_outside_the_limits_is_refused(step: Any, reason: str) -> None:
     with pytest.raises(UnsafeMotion, match=rf"test, step '\w+': .*{reason}"):
-        check_plan(plan_of(step), CONFIG)
+        check_path(plan_of(step), CONFIG)
 
 
 def test_a_line_below_the_table_is_refused() -> None:
     with pytest.raises(UnsafeMotion, match=r"finger tips would be -?\d"):
-        check_plan(plan_of(above(-0.5, 0.0, 0.2), to(-0.5, 0.0, 0.001)), CONFIG)
+        check_path(plan_of(above(-0.5, 0.0, 0.2), to(-0.5, 0.0, 0.001)), CONFIG)
 
 
 def test_a_line_out_of_the_box_is_refused() -> None:
     with pytest.raises(UnsafeMotion, match="leave its box"):
-        check_plan(plan_of(above(-0.4, -0.4, 0.3), to(-0.4, -0.5, 0.3)), CONFIG)
+        check_path(plan_of(above(-0.4, -0.4, 0.3), to(-0.4, -0.5, 0.3)), CONFIG)
 
 
 def test_a_line_out_of_reach_is_refused() -> None:
     wide = CONFIG.model_copy(update={"limits": CONFIG.limits.model_copy(update={"x": (-3.0, 3.0)})})
     with pytest.raises(UnsafeMotion, match=r"cannot reach|singularity"):
-        check_plan(plan_of(above(-0.6, 0.0, 0.3), to(-1.2, 0.0, 0.3)), wide)
+        check_path(plan_of(above(-0.6, 0.0, 0.3), to(-1.2, 0.0, 0.3)), wide)
 
 
 def test_a_line_into_the_bin_wall_is_refused() -> None:
     x, y = CONFIG.bin.center
     edge = y - CONFIG.bin.size[1] / 2
     with pytest.raises(UnsafeMotion, match="keep-out 'bin'"):
-        check_plan(plan_of(above(x, edge, 0.3), to(x, edge, 0.05)), CONFIG)
+        check_path(plan_of(above(x, edge, 0.3), to(x, edge, 0.05)), CONFIG)
 
 
 def test_a_configured_keep_out_is_kept_out_of() -> None:
@@ -127,23 +131,23 @@ def test_a_configured_keep_out_is_kept_out_of() -> None:
     config = CellConfig.model_validate({"keep_out": [shelf]})
     plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
     with pytest.raises(UnsafeMotion, match="keep-out 'shelf'"):
-        check_plan(plan, config)
+        check_path(plan, config)
 
 
 def test_a_load_needs_room_below() -> None:
     shelf = {"name": "shelf", "x": (-0.60, -0.40), "y": (0.0, 0.05), "z": (0.0, 0.22)}
     config = CellConfig.model_validate({"keep_out": [shelf]})
     start, end = above(-0.5, -0.15, 0.3), above(-0.5, 0.15, 0.3)
-    check_plan(plan_of(start, end), config)
+    check_path(plan_of(start, end), config)
     with pytest.raises(UnsafeMotion, match="keep-out 'shelf'"):
-        check_plan(plan_of(start, replace(end, load_m=0.12)), config)
+        check_path(plan_of(start, replace(end, load_m=0.12)), config)
 
 
 def test_an_arm_folded_into_itself_is_refused() -> None:
     folded = HOME.copy()
     folded[2] = 2.95
     with pytest.raises(UnsafeMotion, match="touch"):
-        check_plan(plan_of(joint_move(folded)), CONFIG)
+        check_path(plan_of(joint_move(folded)), CONFIG)
 
 
 def test_a_line_through_the_wrist_singularity_is_refused() -> None:
@@ -159,14 +163,14 @@ def test_a_line_through_the_wrist_singularity_is_refused() -> None:
     T_goal = T.copy()
     T_goal[:3, :3] = T_past[:3, :3]
     with pytest.raises(UnsafeMotion, match=r"singularity|cannot reach"):
-        check_plan(plan_of(joint_move(q), LinearMove("line", T_goal, 0.1, 1.0)), config)
+        check_path(plan_of(joint_move(q), LinearMove("line", T_goal, 0.1, 1.0)), config)
 
 
 def test_a_retreat_from_above_the_table_is_safe() -> None:
     step = above(-0.5, 0.1, 0.01)
     low = state(q=step.q, T_base_tcp=ur5e.forward(step.q) @ rg2.T_FLANGE_TCP)
     plan = plan_retreat(low, CONFIG)
-    check_plan(plan, CONFIG)
+    check_path(plan, CONFIG)
     first = plan.steps[0]
     assert isinstance(first, LinearMove)
     assert first.T_base_tcp[2, 3] > 0.15
@@ -176,9 +180,9 @@ def test_a_retreat_from_too_low_is_safe_and_a_move_along_there_is_not() -> None:
     # Two millimetres above the table, one below the clearance of the tips.
     step = above(-0.5, 0.1, 0.002)
     low = state(q=step.q, T_base_tcp=ur5e.forward(step.q) @ rg2.T_FLANGE_TCP)
-    check_plan(plan_retreat(low, CONFIG), CONFIG)
+    check_path(plan_retreat(low, CONFIG), CONFIG)
     with pytest.raises(UnsafeMotion, match="finger tips"):
-        check_plan(MotionPlan("test", step.q, (to(-0.5, 0.0, 0.002),)), CONFIG)
+        check_path(MotionPlan("test", step.q, (to(-0.5, 0.0, 0.002),)), CONFIG)
 
 
 def test_a_plan_starts_where_the_arm_stands() -> None:
@@ -235,20 +239,20 @@ def test_the_tool_is_judged_by_the_speed_of_its_tip() -> None:
 def test_a_joint_move_that_would_sweep_the_tool_too_fast_is_refused() -> None:
     slow = CellConfig.model_validate({"limits": {"tool_speed_m_s": 0.25}})
     with pytest.raises(UnsafeMotion, match=r"the tool would move at .* lower motion\.joint_speed_rad_s"):
-        check_plan(plan_of(above(-0.5, 0.0, 0.3)), slow)
+        check_path(plan_of(above(-0.5, 0.0, 0.3)), slow)
 
 
 def test_a_line_that_would_turn_a_joint_too_fast_is_refused() -> None:
     slow = CellConfig.model_validate({"limits": {"joint_speed_rad_s": 0.3}, "motion": {"joint_speed_rad_s": 0.3}})
     start = replace(above(-0.3, 0.0, 0.3), speed_rad_s=0.3)
     with pytest.raises(UnsafeMotion, match="a joint would turn at"):
-        check_plan(plan_of(start, to(-0.3, 0.2, 0.3, speed=0.25)), slow)
+        check_path(plan_of(start, to(-0.3, 0.2, 0.3, speed=0.25)), slow)
 
 
 @pytest.mark.parametrize("T", [np.zeros((4, 4)), np.diag([2.0, 1.0, 1.0, 1.0])])
 def test_a_target_that_is_no_pose_is_refused(T: np.ndarray) -> None:
     with pytest.raises(UnsafeMotion, match="the target"):
-        check_plan(plan_of(LinearMove("line", T, 0.1, 1.0)), CONFIG)
+        check_path(plan_of(LinearMove("line", T, 0.1, 1.0)), CONFIG)
 
 
 @pytest.mark.parametrize(
@@ -263,7 +267,7 @@ def test_no_finger_passes_through_a_small_keep_out(box: dict[str, Any]) -> None:
     config = CellConfig.model_validate({"keep_out": [{"name": "pin", **box}]})
     plan = plan_action(action(Primitive.GRASP, -0.5, 0.0, 0.05, 0), heightmap(), HOME, config)
     with pytest.raises(UnsafeMotion, match="keep-out 'pin'"):
-        check_plan(plan, config)
+        check_path(plan, config)
 
 
 @pytest.mark.parametrize(
@@ -293,4 +297,4 @@ def test_a_table_at_another_height_is_as_good(height: float) -> None:
     check_config(config)
     for rotation in (0, 5):
         plan = plan_action(action(Primitive.GRASP, -0.6, 0.1, height + 0.05, rotation), heightmap(), HOME, config)
-        check_plan(plan, config)
+        check_path(plan, config)

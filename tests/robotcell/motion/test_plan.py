@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotcell.config.schema import CellConfig
+from robotcell.config import CellConfig
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.jobs.policy_api import Primitive
-from robotcell.motion.plan import LOAD_REACH_M, TALLEST_OBJECT_M, Grip, JointMove, LinearMove, MotionPlan, plan_action
+from robotcell.motion.grasp import LOAD_REACH_M
+from robotcell.motion.tool import TALLEST_OBJECT_M
+from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, plan_action
 from tests.robotcell.maps import action, heightmap
 
 CONFIG = CellConfig()

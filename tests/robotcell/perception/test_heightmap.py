@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotcell.config.schema import CameraMount, Workspace
+from robotcell.config import CameraMount, Workspace
 from robotcell.geometry.transforms import look_at, make_transform, rotation_z
 from robotcell.interfaces import Intrinsics, RgbdFrame
 from robotcell.perception.heightmap import BAND_M, build_heightmap

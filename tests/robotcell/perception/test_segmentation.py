@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robotcell.config.schema import Workspace
+from robotcell.config import Workspace
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.perception.colors import PALETTE
-from robotcell.perception.segmentation import check_goal_word, find_goal, object_mask, segment
+from robotcell.perception.goals import check_goal_word, find_goal
+from robotcell.perception.segmentation import object_mask, segment
 from tests.robotcell.maps import heightmap
 
 GREY_TABLE = (90, 88, 84)

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError
 
 
@@ -18,7 +18,7 @@ def test_wrong_options_are_refused_with_their_key(key, value):
 
 def test_nothing_heavy_is_imported_before_the_cell_is_connected():
     code = (
-        "import sys; from robotcell.config.schema import load_config; from robotcell.cell import open_cell; "
+        "import sys; from robotcell.config import load_config; from robotcell.cell import open_cell; "
         "open_cell(load_config()); "
         "print([m for m in ('pybullet', 'open3d') if m in sys.modules])"
     )

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robotcell.config.schema import CameraMount, load_config
+from robotcell.config import CameraMount, load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from robotcell.geometry.transforms import invert_transform, look_at, transform_points
 from sim_twin.d415.noise import WARM_UP_FRAMES

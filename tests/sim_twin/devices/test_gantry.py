@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.geometry.transforms import make_transform
 from robotcell.motion.executor import Ending
 from sim_twin.devices.gantry import GantryGripper

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
-from robotcell.config.schema import Workspace, load_config
+from robotcell.config import Workspace, load_config
 from robotcell.errors import ConfigError
 from robotcell.geometry.rg2 import FINGER_BREADTH_M, FINGER_THICKNESS_M
 from robotcell.geometry.transforms import transform_points

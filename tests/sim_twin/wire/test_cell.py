@@ -10,7 +10,7 @@ from multiprocessing.shared_memory import SharedMemory
 
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.cell import ServedCell, is_loopback
 from sim_twin.wire.faults import Fault, Kind

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, GRIPPER_COMMAND, Record, poses_dtype
 from sim_twin.wire.world_process import serve_world
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibration.target.detection import Detector
+from robotcell.config import CameraMount, CellConfig
 from robotcell.config.calibration_file import FixedTag
-from robotcell.config.schema import CameraMount, CellConfig
 from robotcell.errors import CalibrationError
 from robotcell.geometry.transforms import invert_transform, make_transform, transform_points
 from robotcell.perception.board_plate import DEFAULT_BOARD, held_by_gripper

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import transform_points

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from robotcell.config.schema import CameraMount
+from robotcell.config import CameraMount
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options

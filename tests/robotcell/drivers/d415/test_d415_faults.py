@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from robotcell.cell import Cell
+from robotcell.config import CameraMount, load_config
 from robotcell.config.calibration_file import CameraCalibration
-from robotcell.config.schema import CameraMount, load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
-from robotcell.jobs.job import look
+from robotcell.perception.view import look
 from sim_twin.d415.renderer import SERIAL
 from sim_twin.wire.d415.server import FAULTS, WRONG_SERIAL
 from sim_twin.wire.faults import Kind

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import Finding, Grade, examine
 from robotcell.errors import ConfigError
 from robotcell.interfaces import ArmMode
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from robotcell.config.schema import CellConfig
+    from robotcell.config import CellConfig
     from sim_twin.wire.cell import ServedCell
 
 HOST, NUMBER = "127.0.0.48", 48

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from robotcell.config.schema import CellConfig, load_config
+from robotcell.config import CellConfig, load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
 from robotcell.errors import CellError, ConnectionLost

@@ -6,7 +6,7 @@ import multiprocessing
 import socket
 from typing import TYPE_CHECKING
 
-from robotcell.config.schema import load_config
+from robotcell.config import load_config
 from sim_twin.options import NoiseOptions
 from sim_twin.visual import Visual
 from sim_twin.wire.d415.server import serve_camera

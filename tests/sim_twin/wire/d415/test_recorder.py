@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotcell.config.schema import CameraMount, load_config
+from robotcell.config import CameraMount, load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415 import camera as d415
 from robotcell.drivers.d415.camera import D415, D415Options

@@ -1,0 +1,44 @@
+"""The backends by name: which devices stand behind the interfaces."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Protocol
+
+from robotcell.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from robotcell.config.schema import CellConfig
+    from robotcell.interfaces import Devices
+
+
+class Backend(Protocol):
+    """An entry point of the group `robotcell.backends`: a class with these two members."""
+
+    Options: type[BaseModel]
+
+    @staticmethod
+    def open(config: CellConfig) -> Devices:
+        """The devices of a cell, not yet connected; `config.backend.options` fits `Options`."""
+        ...
+
+
+def find_backend(name: str) -> Backend:
+    """The backend of that name.
+
+    Raises:
+        ConfigError: there is none, or it cannot be imported; the message lists those that are installed.
+    """
+    installed = {entry.name: entry for entry in entry_points(group="robotcell.backends")}
+    if name not in installed:
+        raise ConfigError(f"no backend is called {name!r}; installed: {', '.join(sorted(installed)) or 'none'}")
+    try:
+        backend: Backend = installed[name].load()
+    except ImportError as error:
+        raise ConfigError(
+            f"backend {name!r} cannot be imported ({error}); install its extra, for the twin: "
+            "pip install 'robotcell[twin]'"
+        ) from error
+    return backend

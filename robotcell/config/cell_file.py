@@ -1,0 +1,117 @@
+"""Reading `cell.toml`: one file that describes a cell, checked as a whole. With no file the twin with its defaults."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from robotcell.config.backends import find_backend
+from robotcell.config.schema import BackendChoice, CellConfig
+from robotcell.errors import ConfigError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+_DOCS = "docs/configuration.md"
+
+
+def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> CellConfig:
+    """Read and check a cell file.
+
+    Args:
+        path: a TOML file; None for the twin with its defaults.
+        overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
+
+    Raises:
+        ConfigError: naming every bad key at once, each with its value and what is allowed.
+    """
+    values = read_toml(path, "examples/cell.toml") if path else {}
+    if path:
+        _beside(values, path)
+    for key, value in (overrides or {}).items():
+        _set(values, key, value)
+    problems: list[str] = []
+    config = None
+    try:
+        config = CellConfig.model_validate(values)
+    except ValidationError as error:
+        problems += wrong_values(error, _DOCS)
+    backend_table = values.get("backend", {})
+    if isinstance(backend_table, dict):
+        try:
+            backend = find_backend(str(backend_table.get("name", BackendChoice().name)))
+            backend.Options.model_validate(backend_table.get("options", {}))
+        except ConfigError as error:
+            problems.append(f"backend.name: {error}")
+        except ValidationError as error:
+            problems += wrong_values(error, _DOCS, ("backend", "options"))
+    if config is None or problems:
+        place = str(path) if path else "the cell's settings"
+        raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
+    return config
+
+
+def read_toml(path: Path, example: str) -> dict[str, Any]:
+    """The values of a TOML file.
+
+    Args:
+        path: of the file.
+        example: a file to start from, named where there is none.
+
+    Raises:
+        ConfigError: it cannot be read, or is no TOML.
+    """
+    try:
+        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+        return values
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file; start from {example}") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+
+
+def wrong_values(error: ValidationError, docs: str, prefix: tuple[str, ...] = ()) -> list[str]:
+    """A line for each wrong key of a file: the key, its value and what is wrong with it.
+
+    Args:
+        error: of its validation.
+        docs: the page that lists the keys.
+        prefix: of the keys, where a part of the file was validated.
+    """
+    lines = []
+    for detail in error.errors():
+        key = ".".join(str(part) for part in (*prefix, *detail["loc"]))
+        if detail["type"] == "missing":
+            lines.append(f"{key}: missing")
+        elif detail["type"] == "extra_forbidden":
+            lines.append(f"{key} = {detail['input']!r}: unknown key; see {docs} for those that exist")
+        else:
+            lines.append(f"{key} = {detail['input']!r}: {detail['msg'].removeprefix('Value error, ')}")
+    return lines
+
+
+def _beside(values: dict[str, Any], path: Path) -> None:
+    """A relative path of the calibration file starts at the folder of the cell's file."""
+    camera = values.get("camera")
+    if isinstance(camera, dict) and isinstance(camera.get("calibration"), str):
+        camera["calibration"] = str(path.parent / camera["calibration"])
+
+
+def _set(values: dict[str, Any], dotted_key: str, value: object) -> None:
+    *tables, key = dotted_key.split(".")
+    for table in tables:
+        inner = values.setdefault(table, {})
+        if not isinstance(inner, dict):
+            return  # the file holds something else there, which the validation reports
+        values = inner
+    values[key] = value

@@ -1,0 +1,37 @@
+"""Writing images."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+
+from robotcell.errors import StorageError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+    import numpy.typing as npt
+
+
+def write_image(path: Path, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], compression: int = 3) -> None:
+    """Write a PNG; its folder is made.
+
+    Args:
+        path: of the file.
+        image: (H, W, 3) uint8 RGB, or (H, W) of one channel.
+        compression: 0 to 9; more takes longer.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    written, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, compression])
+    if not written:
+        raise StorageError(f"{path}: an image of shape {image.shape} cannot be written as PNG")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise StorageError(f"{path} cannot be written: {error.strerror}; check the folder and the disk") from error

@@ -1,0 +1,50 @@
+"""A decision about to be run, and who follows a job."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from robotcell.jobs.verdict import Outcome
+    from robotcell.motion.actions import Action
+    from robotcell.perception.view import View
+
+
+@dataclass(frozen=True)
+class Decision:
+    """An action about to be run.
+
+    Attributes:
+        index: number of the action in its job, from 1.
+        goal: the word of the goal that it is for; None for any object.
+        view: what it was decided on.
+        action: grasp or push.
+    """
+
+    index: int
+    goal: str | None
+    view: View
+    action: Action
+
+
+class Observer(Protocol):
+    """Follows a job."""
+
+    def started(self, job_id: int, run_dir: Path) -> None:
+        """The job is in the journal and its folder is made."""
+        ...
+
+    def looked(self, view: View) -> None:
+        """The camera was read."""
+        ...
+
+    def decided(self, decision: Decision) -> None:
+        """An action is about to run."""
+        ...
+
+    def ended(self, decision: Decision, outcome: Outcome) -> None:
+        """An action ended."""
+        ...

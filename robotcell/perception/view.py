@@ -1,0 +1,93 @@
+"""One look at the table: a frame, its heightmap, and the objects that it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotcell.errors import CalibrationError, DeviceFault
+from robotcell.geometry.bodies import blocks_view
+from robotcell.perception.calibrated_camera import CalibratedCamera
+from robotcell.perception.heightmap import Heightmap, build_heightmap
+from robotcell.perception.segmentation import Segmentation, segment
+from robotcell.perception.tags import check_tags
+
+if TYPE_CHECKING:
+    from robotcell.config import CellConfig, Workspace
+    from robotcell.interfaces import Devices, RgbdFrame
+
+
+@dataclass(frozen=True)
+class View:
+    """One look at the table.
+
+    Attributes:
+        frame: as the camera delivered it.
+        camera: that took it, as its calibration has it.
+        heightmap: built from both.
+        segmentation: of the heightmap.
+    """
+
+    frame: RgbdFrame
+    camera: CalibratedCamera
+    heightmap: Heightmap
+    segmentation: Segmentation
+
+
+def look(devices: Devices, config: CellConfig, workspace: Workspace | None = None) -> View:
+    """Read the camera and see what is on the table.
+
+    Args:
+        devices: connected.
+        config: of the cell.
+        workspace: the map to build: rectangle and resolution; that of the cell unless given.
+
+    Raises:
+        ConnectionLost, DeviceFault: the camera delivers nothing, or a stale or sparse frame.
+        CalibrationError: the table is not where the configuration has it, a fixed tag not where it was, or the
+            calibration is of another resolution.
+    """
+    limits, workspace = config.limits, workspace or config.workspace
+    camera = CalibratedCamera.of(config.camera)
+    if blocks_view(devices.arm.state().q, camera.position, workspace.x, workspace.y, config.table.height_m):
+        raise DeviceFault(
+            "the arm stands between the camera and the workspace: move it to the home pose, then look", device="arm"
+        )
+    frame = devices.camera.read()
+    age = devices.clock.now() - frame.t
+    if age > limits.frame_age_s:
+        raise DeviceFault(
+            f"frame {frame.number} is {age:.2f} s old (limit {limits.frame_age_s} s): check the camera", device="camera"
+        )
+    if config.camera.measured is not None:
+        check_tags(frame.color, config.camera.measured.tags)
+    heightmap = build_heightmap(frame, camera, workspace, config.table.height_m)
+    _check_coverage(heightmap, limits.min_coverage)
+    _check_table(heightmap, config)
+    return View(frame, camera, heightmap, segment(heightmap))
+
+
+def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:
+    # Without the gaps between pixels, which say something of the resolution and nothing of the view.
+    coverage = float(np.isfinite(heightmap.closed_m).mean())
+    if coverage < min_coverage:
+        raise DeviceFault(
+            f"the camera sees {coverage:.0%} of the workspace (limit {min_coverage:.0%}): check its view, its "
+            f"lens and the light; cells finer than its pixels (here {1000 * heightmap.workspace.resolution_m:g} mm) "
+            "stay empty too",
+            device="camera",
+        )
+
+
+def _check_table(heightmap: Heightmap, config: CellConfig) -> None:
+    table, limits = heightmap.table, config.limits
+    if table is None:
+        raise CalibrationError("too little of the table is seen to tell where it is: clear a part of the workspace")
+    if table.tilt_rad > limits.max_tilt_rad or abs(table.offset_m) > limits.max_table_offset_m:
+        raise CalibrationError(
+            f"the table appears tilted by {np.degrees(table.tilt_rad):.2f} degrees and {1000 * table.offset_m:+.1f} mm "
+            f"off (limits {np.degrees(limits.max_tilt_rad):.2f} degrees, {1000 * limits.max_table_offset_m:.1f} mm): "
+            "check table.height_m and the camera's pose, calibrate again if it was moved"
+        )
