@@ -199,7 +199,7 @@ GOOD_ROW = "red cube.obj -0.5 0 0.025 0 0 0\n"
         (GOOD_ROW + "mauve cube.obj -0.5 0 0.025 0 0 0\n", "line 2: 'mauve' is neither 'block' nor a colour.*pink"),
         (GOOD_ROW + "red cube.obj -0.5 0 high 0 0 0\n", "line 2: z is 'high'"),
         (GOOD_ROW + "red cube.obj -0.5 0 0 0 inf 0\n", "line 2: beta is 'inf'"),
-        (GOOD_ROW + "red cube.stl -0.5 0 0 0 0 0\n", "line 2: 'cube.stl' is not the name of an OBJ file"),
+        (GOOD_ROW + "red cube.step -0.5 0 0 0 0 0\n", "line 2: 'cube.step' is not the name of a mesh file"),
         (GOOD_ROW + "red none.obj -0.5 0 0 0 0 0\n", "line 2: there is no none.obj in"),
         (GOOD_ROW + "red cube.obj -0.5 0 0_1 0 0 0\n", "line 2: z is '0_1', which is no number"),
         (GOOD_ROW + "red cube.obj -0.5 0 \u0661 0 0 0\n", "line 2: z is '\u0661', which is no number"),
