@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import make_transform, rotation_z, rotvec_to_matrix
-from robotcell.perception.colors import PALETTE
+from robotcell.perception.colors import PALETTE, word_to_rgb
 from sim_twin.scenes.meshes import MESH_SUFFIXES, Mesh, bounds_center, mesh_inertia
 from sim_twin.scenes.scene import Scene, SceneObject
 from sim_twin.scenes.shapes import BLOCK_NAMES, Shape, block, load_shape
@@ -138,8 +138,10 @@ class _ObjectTable(_Strict):
             raise ValueError("give either shape (a block) or mesh (a mesh file)")
         if self.shape is not None and self.shape not in BLOCK_NAMES:
             raise ValueError(f"shape {self.shape!r} is no block; there are {', '.join(BLOCK_NAMES)}")
-        if isinstance(self.color, str) and self.color not in PALETTE:
-            raise ValueError(f"color {self.color!r} has no such name; there are {', '.join(PALETTE)}, or [r, g, b]")
+        if isinstance(self.color, str) and word_to_rgb(self.color) is None:
+            raise ValueError(
+                f"color {self.color!r} is no colour; there are {', '.join(PALETTE)}, the names of CSS, or [r, g, b]"
+            )
         return self
 
 
@@ -173,7 +175,7 @@ def _read_toml(path: Path, text: str, meshes: Path | None) -> Scene:
         shape = block(item.shape) if item.shape else load(_toml_mesh(path, item, meshes))
         R = rotvec_to_matrix(item.rotation)
         T = T_scene_group @ _centred_at(item.position, R, shape)
-        color = PALETTE[item.color] if isinstance(item.color, str) else item.color
+        color = _rgb(item.color)
         objects.append(SceneObject(item.name, shape, color, T))
     return Scene(table.name, tuple(objects), table.drop)
 
@@ -251,8 +253,10 @@ def _vpg_row(number: int, fields: list[str]) -> _Row:
 
 def _named_row(number: int, fields: list[str]) -> _Row:
     name = fields[0].lower()
-    if name != "block" and name not in PALETTE:
-        raise ValueError(f"{fields[0]!r} is neither 'block' nor a colour; there are {', '.join(PALETTE)}")
+    if name != "block" and word_to_rgb(name) is None:
+        raise ValueError(
+            f"{fields[0]!r} is neither 'block' nor a colour; there are {', '.join(PALETTE)}, and the names of CSS"
+        )
     return _row(number, fields[1], None if name == "block" else name, fields[2:])
 
 
@@ -324,9 +328,18 @@ def _row_objects(path: Path, rows: list[_Row], meshes: Path) -> tuple[SceneObjec
         color = row.color or next(obstacle_colors)
         # As the file calls it: a colour for a goal.
         label = row.color if isinstance(row.color, str) else "block"
-        rgb = PALETTE[color] if isinstance(color, str) else color
+        rgb = _rgb(color)
         objects.append(SceneObject(f"{label} {shape.name} line {row.number}", shape, rgb, T))
     return tuple(objects)
+
+
+def _rgb(color: str | tuple[int, int, int]) -> tuple[int, int, int]:
+    """RGB, 0..255, of a word that was checked before, or as it is."""
+    if not isinstance(color, str):
+        return color
+    rgb = word_to_rgb(color)
+    assert rgb is not None
+    return rgb
 
 
 class _FrameTable(_Strict):
