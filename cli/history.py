@@ -11,10 +11,11 @@ from rich.text import Text
 
 from cli.console import report_error, results
 from robotcell.errors import CellError
-from robotcell.jobs.journal import Job, Journal, Metrics
+from robotcell.jobs.journal import Journal, Metrics
 
 if TYPE_CHECKING:
     from cli.options import CellChoice
+    from robotcell.jobs.journal_tables import Job
 
 
 def list_jobs(cell: CellChoice, limit: int) -> int:

@@ -22,7 +22,6 @@ from robotcell.jobs.journal import Journal
 from robotcell.jobs.pictures import describe, draw_decision, draw_view
 from robotcell.jobs.verdict import Outcome, Result
 from robotcell.perception.colors import PALETTE
-from robotcell.perception.view import View
 from sim_twin.devices.backend import open_twin
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from robotcell.cell import Cell
     from robotcell.config import CellConfig
     from robotcell.jobs.policy_api import Action, Observation, Policy
+    from robotcell.perception.view import View
     from sim_twin.world.world import World
 
 # Apart by more than any benchmark has trials, so that a redrawn scene is no other trial's.

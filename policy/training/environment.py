@@ -1,6 +1,6 @@
 """The task as a Gymnasium environment over the twin: heightmaps in, grasps and pushes out, the paper's rewards.
 
-The machine is the gripper on slides (`sim_twin.world.sliding_gripper`), so an attempt costs a tenth of what the arm
+The machine is the gripper on slides (`sim_twin.devices.gantry`), so an attempt costs a tenth of what the arm
 needs. What is random of the cell (camera, colours, friction, masses, sizes) is drawn anew for each scene from its seed.
 """
 
@@ -26,17 +26,17 @@ from policy.training.scenes import training_scene
 from robotcell.config import CameraMount, CellConfig
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import look_at, make_transform
+from robotcell.motion.executor import Ending
 from robotcell.motion.grasp import grasp_height
 from robotcell.motion.push import push_height
 from robotcell.motion.rotations import ROTATIONS
 from robotcell.motion.tool import near_height
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 from robotcell.perception.segmentation import MIN_OBJECT_M
-from sim_twin.d415.noise import NoiseOptions
-from sim_twin.devices.backend import TwinOptions
 from sim_twin.devices.camera import TwinCamera
-from sim_twin.world.sliding_gripper import Ending, RigWorld
-from sim_twin.world.world import Friction
+from sim_twin.devices.gantry import GantryGripper
+from sim_twin.options import NoiseOptions, TwinOptions
+from sim_twin.world.bodies import Friction
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -74,9 +74,6 @@ class Outcome(enum.IntEnum):
     COLLIDED = 4
     PUSHED = 5
     NO_START = 6  # nowhere for the closed fingers to come down
-
-
-_OUTCOMES = {Ending.EMPTY: Outcome.EMPTY, Ending.LOST: Outcome.LOST, Ending.COLLIDED: Outcome.COLLIDED}
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         self.action_space = gymnasium.spaces.MultiDiscrete([2, ROTATIONS, rows, cols])
         self._config = config
         self._stage = stage
-        self._world: RigWorld | None = None
+        self._gripper: GantryGripper | None = None
         self._camera: TwinCamera | None = None
         # The camera's pose as its calibration has it.
         self._T_base_camera: Array = np.eye(4)
@@ -195,12 +192,12 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Whatever is done inside is undone at the end: the scene stands as it stood."""
-        world, state = self._need(), self._state
-        saved = world.save()
+        gripper, state = self._need(), self._state
+        saved = gripper.save()
         try:
             yield
         finally:
-            world.restore(saved)
+            gripper.restore(saved)
             self._state = state
 
     def attempt(self, primitive: int, rotation: int, cell: Cell) -> Trial:
@@ -210,13 +207,13 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
 
     def advance(self, primitive: int, rotation: int, cell: Cell) -> Trial:
         """Run an action for good: what was held is taken off the table."""
-        world = self._need()
+        gripper = self._need()
         trial = self._run(primitive, rotation, cell)
         if trial.outcome is Outcome.NO_START:
             return trial
-        world.take(tuple(label - 1 for label in trial.held))
-        world.withdraw()
-        world.take(world.drop_outs())
+        gripper.take(tuple(label - 1 for label in trial.held))
+        gripper.withdraw()
+        gripper.take(gripper.drop_outs())
         self._state = trial.after if trial.after is not None else self._look()
         return trial
 
@@ -224,9 +221,9 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         """End the world. Idempotent."""
         if self._camera is not None:
             self._camera.close()
-        if self._world is not None:
-            self._world.close()
-        self._world = self._camera = self._state = None
+        if self._gripper is not None:
+            self._gripper.close()
+        self._gripper = self._camera = self._state = None
 
     def _build(self, kind: str, count: int, rng: np.random.Generator) -> None:
         config = self._config
@@ -246,18 +243,18 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         scene = training_scene(kind, count, config, rng)
         options = TwinOptions(seed=int(rng.integers(2**31)), noise=NoiseOptions(warm_up=False))
         friction = Friction(float(rng.uniform(*_FRICTION_OBJECTS)), float(rng.uniform(*_FRICTION_TABLE)))
-        self._world = RigWorld(config, options, scene, friction)
-        self._world.connect()
-        self._world.take(self._world.drop_outs())
-        self._camera = TwinCamera(self._world, config.camera, options.noise, options.seed)
+        self._gripper = GantryGripper(config, options, scene, friction)
+        self._gripper.connect()
+        self._gripper.take(self._gripper.drop_outs())
+        self._camera = TwinCamera(self._gripper.world, config.camera, options)
         self._camera.connect()
 
     def _look(self) -> State:
-        world, camera = self._need(), self._camera
+        gripper, camera = self._need(), self._camera
         if camera is None:
             raise RuntimeError("reset the environment first")
         frame, visual = camera.read_with_truth()
-        index_of = np.array([*(v.object_index + 1 for v in world.visuals()), 0])
+        index_of = np.array([*(v.object_index + 1 for v in gripper.world.visuals()), 0])
         label = index_of[visual]
         bits = {str(bit): (label >> bit & 1).astype(np.bool_) for bit in range(_BITS)}
         config = self._config
@@ -283,22 +280,23 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         return self._grasp(rotation % (ROTATIONS // 2), cell) if primitive == GRASP else self._push(rotation, cell)
 
     def _grasp(self, rotation: int, cell: Cell) -> Trial:
-        world, state, config = self._need(), self.state, self._config
+        gripper, state, config = self._need(), self.state, self._config
         table = config.table.height_m
         x, y = config.workspace.position(*cell)
         theta = 2 * np.pi * rotation / ROTATIONS
         tcp_z = table + grasp_height(surface_at(state.height_m, cell), config)
         near_z = near_height(state.heightmap, x, y, theta, config.gripper.preshape_m, tcp_z, config)
-        attempt = world.grasp(x, y, theta, near_z, tcp_z)
+        attempt = gripper.grasp(x, y, theta, near_z, tcp_z)
         target = int(state.labels[cell])
-        if attempt.ending is Ending.HELD:
+        if attempt.held:
             held = tuple(i + 1 for i in attempt.held)
             outcome = Outcome.PICKED if target in held else Outcome.OTHER_OBJECT
             return Trial(outcome, held, ((cell, target, (1.0, float(target in held)), False),))
-        return Trial(_OUTCOMES[attempt.ending], (), ((cell, target, (0.0, 0.0), False),))
+        failed = {Ending.EMPTY: Outcome.EMPTY, Ending.CONTACT: Outcome.COLLIDED, Ending.DONE: Outcome.LOST}
+        return Trial(failed[attempt.ending], (), ((cell, target, (0.0, 0.0), False),))
 
     def _push(self, rotation: int, cell: Cell) -> Trial:
-        world, state, config = self._need(), self.state, self._config
+        gripper, state, config = self._need(), self.state, self._config
         table, workspace = config.table.height_m, config.workspace
         target = int(state.labels[cell])
         nothing = ((cell, target, (0.0, 0.0), False),)
@@ -310,12 +308,12 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         tcp_z = table + push_height(line.top_m, config)
         near_z = near_height(state.heightmap, x, y, theta, 0.0, tcp_z, config)
         length = (len(line.cells) - 1) * workspace.resolution_m
-        before = world.save()
-        attempt = world.push((x, y), theta, length, near_z, tcp_z)
-        if attempt.ending is Ending.COLLIDED:
+        before = gripper.save()
+        attempt = gripper.push((x, y), theta, length, near_z, tcp_z)
+        if attempt.ending is Ending.CONTACT:
             return Trial(Outcome.COLLIDED, (), nothing)
-        world.withdraw()
-        moved = _moved(before, world.save())
+        gripper.withdraw()
+        moved = _moved(before, gripper.save())
         after = self._look()
         return Trial(Outcome.PUSHED, (), self._push_rows(cell, line, moved, after), after)
 
@@ -356,10 +354,10 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
     def _info(self) -> dict[str, Any]:
         return {"labels": self.state.labels.copy(), "goal": self._goal}
 
-    def _need(self) -> RigWorld:
-        if self._world is None:
+    def _need(self) -> GantryGripper:
+        if self._gripper is None:
             raise RuntimeError("reset the environment first")
-        return self._world
+        return self._gripper
 
 
 def _moved(

@@ -28,10 +28,10 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict
 
 if TYPE_CHECKING:
     from robotcell.interfaces import Intrinsics
+    from sim_twin.options import NoiseOptions
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
@@ -75,21 +75,6 @@ _DRIFT_PERIODS_S = (23.0, 71.0, 311.0)
 _EXPOSURE_START = 0.25
 _EXPOSURE_FRAMES = 5.0
 WARM_UP_FRAMES = 30
-
-
-class NoiseOptions(BaseModel):
-    """Which errors of the D415 the twin's camera shows."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    disparity_noise: bool = True
-    quantisation: bool = True
-    edge_bleeding: bool = True
-    dropout: bool = True
-    occlusion: bool = True
-    warm_up: bool = True
-    color_noise: bool = True
-    white_balance: bool = True
 
 
 def degrade_depth(

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import functools
-import importlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from robotcell.drivers.d415.libusb import load_libusb
-from robotcell.errors import ConfigError
+from sim_twin.d415.open3d_core import load_open3d
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Intrinsics
-    from sim_twin.world.world import Visual
+    from sim_twin.visual import Visual
 
 Floats = npt.NDArray[np.float32]
 Indices = npt.NDArray[np.int32]
@@ -116,24 +113,6 @@ class RayCaster:
         T = poses.astype(np.float32)[self._visual_of_vertex]
         rotated = np.einsum("nij,nj->ni", T[:, :3, :3], self._vertices)
         return np.ascontiguousarray(rotated + T[:, :3, 3], dtype=np.float32)
-
-
-@functools.cache
-def load_open3d() -> Any:
-    """The module open3d, which needs libusb at import even where no camera is used.
-
-    Where the system has no libusb, the one in the `libusb-package` wheel is loaded for the whole process.
-
-    Raises:
-        ConfigError: open3d or libusb is not installed.
-    """
-    load_libusb("open3d", "twin")
-    try:
-        return importlib.import_module("open3d")
-    except ImportError as error:
-        raise ConfigError(
-            f"the twin's camera cannot load open3d ({error}); install the twin: pip install 'robotcell[twin]'"
-        ) from error
 
 
 def _rays(intrinsics: Intrinsics, T_base_camera: Array) -> Floats:

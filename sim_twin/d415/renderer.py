@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -12,19 +13,22 @@ from robotcell.geometry.transforms import invert_transform, transform_points
 from robotcell.interfaces import Intrinsics
 from sim_twin.d415.noise import degrade_color, degrade_depth
 from sim_twin.d415.rays import Hits, RayCaster, ray_directions
+from sim_twin.options import DepthError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from robotcell.config import CameraMount
     from robotcell.geometry.transforms import Array
-    from sim_twin.d415.noise import NoiseOptions
-    from sim_twin.world.world import Visual
+    from sim_twin.options import TwinOptions
+    from sim_twin.visual import Visual
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
 FRAMES_PER_S = 30
+# Of the twin's camera.
+SERIAL = "000000000415"
 
 # A D415's colour stream sees 69.3 x 42.5 degrees at 16:9 (datasheet 69 x 42; read from a unit in
 # librealsense issue 4179): a focal length of 926 px at 1280x720. 640x480 is cut out of the same image and
@@ -44,31 +48,41 @@ _AMBIENT = 0.5
 _PIXEL_PARTS = 4
 
 
+def reported_intrinsics(resolution: str, options: TwinOptions) -> Intrinsics:
+    """What the camera says of its intrinsics in a mode; it sees with those in `MODES`."""
+    optics, error = MODES[resolution], options.intrinsics_error
+    return replace(
+        optics,
+        fx=optics.fx * (1 + error.focal),
+        fy=optics.fy * (1 + error.focal),
+        cx=optics.cx + error.cx_px,
+        cy=optics.cy + error.cy_px,
+    )
+
+
 class Renderer:
     """Renders one list of meshes for one camera; the perfect image first, then what the device makes of it.
 
     Args:
         visuals: what there is to see.
         mount: resolution and place of the camera.
-        noise: which errors of the device to make.
-        seed: of the errors; the same seed and frame number give the same errors.
-        T_base_camera: where the camera really stands (4, 4); where the mount has it without a calibration unless given.
+        options: which errors the device makes, and how far it stands from its place; the same seed and frame number
+            give the same errors.
+
+    Attributes:
+        intrinsics: with which the camera sees.
+        reported_intrinsics: those that it reports.
     """
 
-    def __init__(
-        self,
-        visuals: Sequence[Visual],
-        mount: CameraMount,
-        noise: NoiseOptions,
-        seed: int,
-        T_base_camera: Array | None = None,
-    ) -> None:
+    def __init__(self, visuals: Sequence[Visual], mount: CameraMount, options: TwinOptions) -> None:
         self.visuals = visuals
         self.intrinsics = MODES[mount.resolution]
+        self.reported_intrinsics = reported_intrinsics(mount.resolution, options)
         self._min_depth_m = _MIN_DEPTH_M[mount.resolution]
-        self._noise = noise
-        self._seed = seed
-        self._T_base_camera = mount.nominal() if T_base_camera is None else T_base_camera
+        self._noise = options.noise
+        self._seed = options.seed
+        self._depth_error = options.depth_error
+        self._T_base_camera = options.camera_pose(mount)
         self._caster = RayCaster(visuals, self.intrinsics, self._T_base_camera)
         # Metres along each pixel's ray for a metre of depth.
         self._pixel_range = np.linalg.norm(ray_directions(self.intrinsics), axis=2).astype(np.float32)
@@ -140,7 +154,11 @@ class Renderer:
         """(H, W) [m], 0 = no return: what the device reports of a true depth in one frame."""
         inside = (depth_m >= self._min_depth_m) & (depth_m <= _MAX_DEPTH_M)
         in_range = np.where(inside, depth_m, np.float32(0))
-        return degrade_depth(in_range, incidence_cos, self.intrinsics, self._noise, seed=self._seed, frame=frame)
+        depth = degrade_depth(in_range, incidence_cos, self.intrinsics, self._noise, seed=self._seed, frame=frame)
+        if self._depth_error != DepthError():
+            off = np.float32(self._depth_error.scale) * depth + np.float32(self._depth_error.offset_m)
+            depth = np.where(depth > 0, off, depth)
+        return depth
 
     def measured_color(self, color: Bytes, frame: int, t: float, frames_since_start: int) -> Bytes:
         """(H, W, 3): what the device reports of true colours in one frame; arguments as in `degrade_color`."""

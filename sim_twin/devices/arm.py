@@ -17,7 +17,7 @@ from robotcell.geometry.transforms import interpolate_transforms, invert_transfo
 from robotcell.interfaces import KICK_TIMEOUT_S, Arm, ArmMode, ArmState
 from sim_twin.devices.trajectory import slow_down, trapezoid
 from sim_twin.world import robot_model
-from sim_twin.world.world import STEP_S
+from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
     from robotcell.interfaces import Array

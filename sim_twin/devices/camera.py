@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import Camera, RgbdFrame
-from sim_twin.d415.noise import WARM_UP_FRAMES, NoiseOptions
-from sim_twin.d415.rays import Indices, load_open3d
-from sim_twin.d415.renderer import FRAMES_PER_S, Floats, Renderer
-from sim_twin.wire.d415.stream import SERIAL
-from sim_twin.world.world import STEP_S
+from sim_twin.d415.noise import WARM_UP_FRAMES
+from sim_twin.d415.open3d_core import load_open3d
+from sim_twin.d415.renderer import FRAMES_PER_S, SERIAL, Floats, Renderer
+from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
     from robotcell.config import CameraMount
-    from robotcell.geometry.transforms import Array
+    from sim_twin.d415.rays import Indices
+    from sim_twin.options import TwinOptions
     from sim_twin.world.world import World
 
 _STEPS_PER_FRAME = round(1 / (FRAMES_PER_S * STEP_S))
@@ -31,24 +31,14 @@ class TwinCamera(Camera):
     Args:
         world: what there is to see.
         mount: resolution and place.
-        noise: which errors of the device to make.
-        seed: of the errors; the same seed at the same time gives the same frame.
-        T_base_camera: where it really stands (4, 4); where the mount has it without a calibration unless given.
+        options: which errors the device makes, and how far it stands from its place; the same seed at the same time
+            gives the same frame.
     """
 
-    def __init__(
-        self,
-        world: World,
-        mount: CameraMount,
-        noise: NoiseOptions,
-        seed: int,
-        T_base_camera: Array | None = None,
-    ) -> None:
+    def __init__(self, world: World, mount: CameraMount, options: TwinOptions) -> None:
         self._world = world
         self._mount = mount
-        self._T_base_camera = mount.nominal() if T_base_camera is None else T_base_camera
-        self._noise = noise
-        self._seed = seed
+        self._options = options
         self._first_frame: int | None = None
         self._renderer: Renderer | None = None
 
@@ -69,7 +59,7 @@ class TwinCamera(Camera):
         try:
             self._prepare()
             self._first_frame = self._frame_number()
-            if self._noise.warm_up:
+            if self._options.noise.warm_up:
                 self._world.step(WARM_UP_FRAMES * _STEPS_PER_FRAME)
         except BaseException:
             self._first_frame = None
@@ -107,7 +97,7 @@ class TwinCamera(Camera):
             number=number,
             color=renderer.measured_color(renderer.color(hits), number, t, number - first_frame),
             depth_m=renderer.measured_depth(hits.depth_m, renderer.incidence_cos(hits), number),
-            intrinsics=renderer.intrinsics,
+            intrinsics=renderer.reported_intrinsics,
             serial=SERIAL,
         )
         return frame, hits.visual()
@@ -137,5 +127,5 @@ class TwinCamera(Camera):
     def _prepare(self) -> Renderer:
         visuals = self._world.visuals()
         if self._renderer is None or visuals is not self._renderer.visuals:
-            self._renderer = Renderer(visuals, self._mount, self._noise, self._seed, self._T_base_camera)
+            self._renderer = Renderer(visuals, self._mount, self._options)
         return self._renderer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from sim_twin.world.world import STEP_S
+from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
     from sim_twin.world.world import World

@@ -9,7 +9,7 @@ from robotcell.errors import ConnectionLost, UnsafeMotion
 from robotcell.geometry import rg2
 from robotcell.interfaces import Gripper, GripperState
 from sim_twin.world import robot_model
-from sim_twin.world.world import STEP_S
+from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array

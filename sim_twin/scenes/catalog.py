@@ -56,7 +56,7 @@ def make_scene(
         seed: of what those three draw.
         workspace: where the scene is put.
         table_height_m: z of the table top.
-        meshes: folder with the OBJ files that a scene file names.
+        meshes: folder with the mesh files that a scene file names.
 
     Raises:
         ConfigError: there is no such scene (the message lists what there is), or its file is malformed.

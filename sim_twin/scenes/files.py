@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import make_transform, rotation_z, rotvec_to_matrix
-from robotcell.perception.colors import PALETTE
-from sim_twin.scenes.meshes import Mesh, bounds_center, mesh_inertia, parse_number
+from robotcell.perception.colors import PALETTE, word_to_rgb
+from sim_twin.scenes.meshes import MESH_SUFFIXES, Mesh, bounds_center, mesh_inertia
 from sim_twin.scenes.scene import Scene, SceneObject
 from sim_twin.scenes.shapes import BLOCK_NAMES, Shape, block, load_shape
 
@@ -52,13 +52,13 @@ def read_scene(path: Path, meshes: Path | None) -> Scene:
 
     Args:
         path: the file.
-        meshes: folder of the OBJ files that it names; a TOML file may also have them beside itself.
+        meshes: folder of the mesh files that it names; a TOML file may also have them beside itself.
 
     Raises:
         ConfigError: the file or a mesh is missing or malformed; the message names file, line or key, and reason.
     """
     if meshes is not None and not meshes.is_dir():
-        raise ConfigError(f"{meshes}: no such folder; --meshes names that of the OBJ files")
+        raise ConfigError(f"{meshes}: no such folder; --meshes names that of the mesh files")
     text = _text(path)
     if path.suffix.lower() == ".toml":
         return _read_toml(path, text, meshes)
@@ -135,11 +135,13 @@ class _ObjectTable(_Strict):
     @model_validator(mode="after")
     def _is_known(self) -> _ObjectTable:
         if (self.shape is None) == (self.mesh is None):
-            raise ValueError("give either shape (a block) or mesh (an OBJ file)")
+            raise ValueError("give either shape (a block) or mesh (a mesh file)")
         if self.shape is not None and self.shape not in BLOCK_NAMES:
             raise ValueError(f"shape {self.shape!r} is no block; there are {', '.join(BLOCK_NAMES)}")
-        if isinstance(self.color, str) and self.color not in PALETTE:
-            raise ValueError(f"color {self.color!r} has no such name; there are {', '.join(PALETTE)}, or [r, g, b]")
+        if isinstance(self.color, str) and word_to_rgb(self.color) is None:
+            raise ValueError(
+                f"color {self.color!r} is no colour; there are {', '.join(PALETTE)}, the names of CSS, or [r, g, b]"
+            )
         return self
 
 
@@ -173,7 +175,7 @@ def _read_toml(path: Path, text: str, meshes: Path | None) -> Scene:
         shape = block(item.shape) if item.shape else load(_toml_mesh(path, item, meshes))
         R = rotvec_to_matrix(item.rotation)
         T = T_scene_group @ _centred_at(item.position, R, shape)
-        color = PALETTE[item.color] if isinstance(item.color, str) else item.color
+        color = _rgb(item.color)
         objects.append(SceneObject(item.name, shape, color, T))
     return Scene(table.name, tuple(objects), table.drop)
 
@@ -237,7 +239,7 @@ def _read_rows(path: Path, text: str, meshes: Path | None) -> Scene:
     if not present:
         raise ConfigError(f"{path}: every object is parked outside the workspace; nothing is left to pick")
     if meshes is None:
-        raise ConfigError(f"{path}: the scene names OBJ files; give their folder with --meshes DIR")
+        raise ConfigError(f"{path}: the scene names mesh files; give their folder with --meshes DIR")
     return Scene(path.stem, _row_objects(path, present, meshes), drop=False)
 
 
@@ -251,16 +253,18 @@ def _vpg_row(number: int, fields: list[str]) -> _Row:
 
 def _named_row(number: int, fields: list[str]) -> _Row:
     name = fields[0].lower()
-    if name != "block" and name not in PALETTE:
-        raise ValueError(f"{fields[0]!r} is neither 'block' nor a colour; there are {', '.join(PALETTE)}")
+    if name != "block" and word_to_rgb(name) is None:
+        raise ValueError(
+            f"{fields[0]!r} is neither 'block' nor a colour; there are {', '.join(PALETTE)}, and the names of CSS"
+        )
     return _row(number, fields[1], None if name == "block" else name, fields[2:])
 
 
 def _row(number: int, mesh: str, color: str | tuple[int, int, int] | None, fields: list[str]) -> _Row:
     # Published files use either slash.
     name = PureWindowsPath(mesh).name
-    if not name.lower().endswith(".obj"):
-        raise ValueError(f"{mesh[:80]!r} is not the name of an OBJ file")
+    if not name.lower().endswith(MESH_SUFFIXES):
+        raise ValueError(f"{mesh[:80]!r} is not the name of a mesh file ({', '.join(MESH_SUFFIXES)})")
     numbers = _numbers(fields, ("x", "y", "z", "alpha", "beta", "gamma"))
     return _Row(number, name, color, numbers[:3], numbers[3:])
 
@@ -269,12 +273,29 @@ def _numbers(fields: list[str], names: tuple[str, ...]) -> Array:
     values = []
     for field, name in zip(fields, names, strict=True):
         try:
-            values.append(parse_number(field))
+            values.append(_number(field))
         except ValueError as error:
             raise ValueError(f"{name} is {error}") from None
         if abs(values[-1]) > _LARGEST:
             raise ValueError(f"{name} is {field[:40]!r}; it must lie within {_LARGEST:.0f}")
     return np.array(values)
+
+
+def _number(field: str) -> float:
+    """A finite number in plain ASCII notation.
+
+    Raises:
+        ValueError: it is none; Python's own `1_000` and foreign digits count as none.
+    """
+    try:
+        if "_" in field or not field.isascii():
+            raise ValueError
+        number = float(field)
+    except ValueError:
+        raise ValueError(f"{field[:40]!r}, which is no number") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{field[:40]!r}; it must be finite")
+    return number
 
 
 def _parked(row: _Row) -> bool:
@@ -307,9 +328,18 @@ def _row_objects(path: Path, rows: list[_Row], meshes: Path) -> tuple[SceneObjec
         color = row.color or next(obstacle_colors)
         # As the file calls it: a colour for a goal.
         label = row.color if isinstance(row.color, str) else "block"
-        rgb = PALETTE[color] if isinstance(color, str) else color
+        rgb = _rgb(color)
         objects.append(SceneObject(f"{label} {shape.name} line {row.number}", shape, rgb, T))
     return tuple(objects)
+
+
+def _rgb(color: str | tuple[int, int, int]) -> tuple[int, int, int]:
+    """RGB, 0..255, of a word that was checked before, or as it is."""
+    if not isinstance(color, str):
+        return color
+    rgb = word_to_rgb(color)
+    assert rgb is not None
+    return rgb
 
 
 class _FrameTable(_Strict):

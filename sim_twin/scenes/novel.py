@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from robotcell.errors import ConfigError
-from sim_twin.scenes.meshes import Mesh, hull, load_obj, mesh_volume
+from sim_twin.scenes.meshes import Mesh, hull, mesh_volume
 from sim_twin.scenes.shapes import shape_of
 
 if TYPE_CHECKING:
@@ -86,8 +86,10 @@ def novel_shape(number: int) -> Shape:
     """
     if not 0 <= number < NOVEL_COUNT:
         raise ConfigError(f"novel object {number} is outside 0 to {NOVEL_COUNT - 1}")
+    from sim_twin.scenes.mesh_files import load_meshes
+
     path = _folder() / f"{number:03d}" / f"{number:03d}.obj"
-    return shape_of(f"novel_{number:03d}", tuple(Mesh(_SCALE * m.vertices, m.triangles) for m in load_obj(path)))
+    return shape_of(f"novel_{number:03d}", tuple(Mesh(_SCALE * m.vertices, m.triangles) for m in load_meshes(path)))
 
 
 @cache

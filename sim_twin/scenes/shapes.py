@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.errors import ConfigError
-from sim_twin.scenes.meshes import Mesh, convex_parts, hull, join, load_obj, mesh_centroid, mesh_volume
+from sim_twin.scenes.convex_parts import convex_parts
+from sim_twin.scenes.meshes import Mesh, hull, join, mesh_centroid, mesh_volume
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,16 +67,18 @@ def block(name: str) -> Shape:
 
 
 def load_shape(path: Path) -> Shape:
-    """The solid of an OBJ file [m]; concave objects in it collide in convex pieces.
+    """The solid of a mesh file [m], see `mesh_files`; concave objects in it collide in convex pieces.
 
     Raises:
         ConfigError: the file is missing or malformed, or of a size that speaks for another unit.
     """
-    meshes = load_obj(path)
+    from sim_twin.scenes.mesh_files import load_meshes
+
+    meshes = load_meshes(path)
     extent = float(np.ptp(join(meshes).vertices, axis=0).max())
     if not _EXTENT_M[0] <= extent <= _EXTENT_M[1]:
         raise ConfigError(
-            f"{path}: extent {extent:.3g} m; OBJ files are read in metres, and a mesh must measure "
+            f"{path}: extent {extent:.3g} m; it is read in metres, and a mesh must measure "
             f"{_EXTENT_M[0]} to {_EXTENT_M[1]} m"
         )
     try:

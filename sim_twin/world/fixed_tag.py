@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from robotcell.perception.tags import FAMILY
-from sim_twin.world.world import Visual
+from sim_twin.visual import Visual
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig

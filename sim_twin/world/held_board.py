@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from calibration.target.board import DEFAULT_BOARD, PLATE_M, TAB_M, draw_plate, held_by_gripper, plate_corners
 from robotcell.geometry.transforms import Array, make_transform, transform_points
-from sim_twin.world.world import Visual
+from robotcell.perception.board_plate import DEFAULT_BOARD, PLATE_M, TAB_M, draw_plate, held_by_gripper, plate_corners
+from sim_twin.visual import Visual
 
 # By hand, a plate is put between the fingers about so well (assumed).
 _POSITION_RMS_M = 0.002

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, make_transform, transform_points
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 ARM_JOINTS = tuple(f"joint_{i}" for i in range(1, 7))
 LEFT_CRANK, LEFT_FINGER = "left_crank", "left_finger"
@@ -109,6 +112,21 @@ class Link:
     parts: tuple[Part, ...]
 
 
+@dataclass(frozen=True)
+class Machine:
+    """What carries the gripper.
+
+    Attributes:
+        urdf: its links, joints, masses and collision shapes, as URDF text; inertias are left to the engine.
+        start: angles [rad] by the names of joints; all others start at 0.
+        visible: whether it stands on the table and a camera can see it.
+    """
+
+    urdf: str
+    start: dict[str, float]
+    visible: bool
+
+
 def links() -> tuple[Link, ...]:
     """Every link but the base, parents first."""
     return (*_arm_links(), *_gripper_links())
@@ -149,8 +167,23 @@ def finger_angles(crank_angle: float) -> dict[str, float]:
     }
 
 
-def urdf() -> str:
-    """The arm and its gripper as URDF: collision shapes and masses only; inertias are left to the engine."""
+def arm_machine(home_q: Sequence[float]) -> Machine:
+    """The arm and its gripper, the arm's joints (6,) [rad] at home."""
+    return Machine(_arm_urdf(), dict(zip(ARM_JOINTS, home_q, strict=True)), visible=True)
+
+
+def gantry_machine() -> Machine:
+    """The gripper alone, on two slides: along x and along z of a base that stands in the axes of the flange."""
+    return Machine(_gantry_urdf(), {}, visible=False)
+
+
+def part_mesh(part: Part) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    """Vertices (N, 3) [m] in the link frame and triangles (M, 3) of a part, wound outwards."""
+    vertices, triangles = _box_mesh(part.size) if part.kind == "box" else _cylinder_mesh(part.size[0], part.size[1])
+    return transform_points(part.T_link_part, vertices).astype(np.float32), triangles
+
+
+def _arm_urdf() -> str:
     lines = ['<?xml version="1.0"?>', '<robot name="ur5e_rg2">']
     lines += _urdf_link(BASE_LINK, 4.0, (0.0, 0.0, 0.0), base_parts())
     for link in links():
@@ -159,9 +192,8 @@ def urdf() -> str:
     return "\n".join(lines)
 
 
-def rig_urdf() -> str:
-    """The gripper alone, on two slides: along x and along z of a base that stands in the axes of the flange."""
-    lines = ['<?xml version="1.0"?>', '<robot name="rg2_rig">']
+def _gantry_urdf() -> str:
+    lines = ['<?xml version="1.0"?>', '<robot name="rg2_gantry">']
     lines += _urdf_link(BASE_LINK, 1.0, (0.0, 0.0, 0.0), ())
     parent = BASE_LINK
     for joint, axis in ((SLIDE_X, (1.0, 0.0, 0.0)), (SLIDE_Z, (0.0, 0.0, 1.0))):
@@ -174,12 +206,6 @@ def rig_urdf() -> str:
         lines += _urdf_jointed(link, "continuous" if link.axis else "fixed")
     lines.append("</robot>")
     return "\n".join(lines)
-
-
-def part_mesh(part: Part) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    """Vertices (N, 3) [m] in the link frame and triangles (M, 3) of a part, wound outwards."""
-    vertices, triangles = _box_mesh(part.size) if part.kind == "box" else _cylinder_mesh(part.size[0], part.size[1])
-    return transform_points(part.T_link_part, vertices).astype(np.float32), triangles
 
 
 def _arm_links() -> list[Link]:

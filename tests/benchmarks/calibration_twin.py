@@ -33,7 +33,8 @@ from calibration.solve.solver import solve
 from calibration.target.board import DEFAULT_BOARD, held_by_gripper
 from robotcell.config import load_config
 from robotcell.errors import CellError
-from sim_twin.devices.backend import TwinOptions, open_twin
+from sim_twin.devices.backend import open_twin
+from sim_twin.options import TwinOptions
 
 LIMIT_MM, LIMIT_DEG = 0.7, 0.05
 # How far the camera stands from where the configuration has it, along and about each axis.

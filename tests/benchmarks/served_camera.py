@@ -14,7 +14,7 @@ from robotcell.config import load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from sim_twin.d415.renderer import MODES, Renderer
-from sim_twin.devices.backend import TwinOptions
+from sim_twin.options import TwinOptions
 from sim_twin.wire.d415.stream import Frame, Image, encode
 from sim_twin.world.world import World
 from tests.sim_twin.wire.d415.served_camera import RawClient, ServedCamera
@@ -37,7 +37,7 @@ def ten_objects():
 def parts(served, resolution):
     """Median milliseconds of the steps of a frame."""
     mount = served.config.camera.model_copy(update={"resolution": resolution})
-    renderer = Renderer(served.visuals, mount, TwinOptions().noise, 0)
+    renderer = Renderer(served.visuals, mount, TwinOptions())
     taken = {name: [] for name in ("rays", "shading", "depth noise", "colour noise", "encoding")}
 
     def timed(name, do, *arguments):

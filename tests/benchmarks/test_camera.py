@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from robotcell.config import CameraMount
-from sim_twin.d415.noise import NoiseOptions, degrade_color, degrade_depth
+from sim_twin.d415.noise import degrade_color, degrade_depth
 from sim_twin.d415.rays import RayCaster
 from sim_twin.d415.renderer import MODES
 from sim_twin.devices.camera import TwinCamera
+from sim_twin.options import NoiseOptions, TwinOptions
 from tests.sim_twin.boxes import table_with_blocks
 
 RESOLUTIONS = pytest.mark.parametrize("resolution", sorted(MODES, reverse=True))
@@ -16,13 +17,13 @@ RESOLUTIONS = pytest.mark.parametrize("resolution", sorted(MODES, reverse=True))
 
 @pytest.fixture
 def frame(resolution):
-    with TwinCamera(table_with_blocks(30), CameraMount(resolution=resolution), NoiseOptions(), 1) as camera:
+    with TwinCamera(table_with_blocks(30), CameraMount(resolution=resolution), TwinOptions(seed=1)) as camera:
         return camera.read()
 
 
 @RESOLUTIONS
 def test_read(benchmark, resolution):
-    with TwinCamera(table_with_blocks(30), CameraMount(resolution=resolution), NoiseOptions(), 1) as camera:
+    with TwinCamera(table_with_blocks(30), CameraMount(resolution=resolution), TwinOptions(seed=1)) as camera:
         frame = benchmark(camera.read)
     assert frame.depth_m.any()
 

@@ -62,12 +62,12 @@ def test_a_quarter_second_awake(benchmark, count):
     """Every object awake, as while the gripper is among them."""
     cell, world = twin(count)
     with cell.arm, cell.gripper:
-        built = world._need()
-        wake = built.engine.ACTIVATION_STATE_WAKE_UP
+        simulation = world.simulation
+        wake = simulation.engine.ACTIVATION_STATE_WAKE_UP
 
         def rouse():
-            for body in built.bodies:
-                built.engine.changeDynamics(body, -1, activationState=wake, physicsClientId=built.client)
+            for body in simulation.bodies:
+                simulation.engine.changeDynamics(body, -1, activationState=wake, physicsClientId=simulation.client)
 
         # Shorter than the time after which what rests is put to sleep again.
         benchmark.pedantic(world.step, args=(STEPS // 2,), setup=rouse, rounds=15)

@@ -11,7 +11,7 @@ from calibration.solve.rigid import difference
 from cli.main import app
 from robotcell.config import load_config
 from robotcell.config.calibration_file import load_calibration
-from sim_twin.devices.backend import TwinOptions
+from sim_twin.options import TwinOptions
 
 OFFSET = [0.009, -0.007, 0.006, 0.006, -0.008, 0.010]
 CELL = """

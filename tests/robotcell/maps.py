@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.config import CellConfig, Workspace
-from robotcell.motion.actions import Action
 from robotcell.motion.grasp import Grasp
 from robotcell.motion.push import push_in_workspace
 from robotcell.motion.rotations import ROTATIONS
@@ -16,6 +15,8 @@ from robotcell.perception.heightmap import Heightmap, TablePlane
 
 if TYPE_CHECKING:
     import numpy.typing as npt
+
+    from robotcell.motion.actions import Action
 
 
 def heightmap(height_m: npt.NDArray[np.float32] | None = None, workspace: Workspace | None = None) -> Heightmap:

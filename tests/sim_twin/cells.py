@@ -10,12 +10,10 @@ from robotcell.config import load_config
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, make_transform
 from sim_twin.devices import backend
-from sim_twin.scenes import catalog as scenes
+from sim_twin.scenes.scene import Scene, SceneObject
 from sim_twin.scenes.shapes import block
 
 if TYPE_CHECKING:
-    import pytest
-
     from robotcell.cell import Cell
     from sim_twin.world.world import World
 
@@ -24,17 +22,13 @@ PERIOD_S = 0.008
 _Q_NEAR = (-0.27, -1.55, 1.70, -1.70, -1.57, 1.3)
 
 
-def with_block(
-    monkeypatch: pytest.MonkeyPatch, name: str, x: float, y: float, turn: Array | None = None
-) -> tuple[Cell, World]:
+def with_block(name: str, x: float, y: float, turn: Array | None = None) -> tuple[Cell, World]:
     """A cell, not yet connected, on whose table a single block stands; and its world."""
     shape = block(name)
     R = np.eye(3) if turn is None else turn
     z = -float((shape.mesh.vertices @ R.T)[:, 2].min())
-    item = scenes.SceneObject("block", shape, (200, 30, 30), make_transform(R, (x, y, z)))
-    scene = scenes.Scene("one block", (item,), drop=False)
-    monkeypatch.setattr(scenes, "make_scene", lambda *_: scene)
-    return open_twin()
+    item = SceneObject("block", shape, (200, 30, 30), make_transform(R, (x, y, z)))
+    return backend.open_twin(load_config(), Scene("one block", (item,), drop=False))
 
 
 def open_twin(**options: object) -> tuple[Cell, World]:

@@ -16,12 +16,12 @@ from multiprocessing.connection import wait
 from typing import TYPE_CHECKING
 
 from robotcell.errors import CellError, ConfigError
-from sim_twin.d415.rays import load_open3d
-from sim_twin.d415.renderer import FRAMES_PER_S, MODES, Renderer
-from sim_twin.devices.backend import TwinOptions
+from sim_twin.d415.open3d_core import load_open3d
+from sim_twin.d415.renderer import FRAMES_PER_S, MODES, SERIAL, Renderer, reported_intrinsics
+from sim_twin.options import TwinOptions
 from sim_twin.wire.d415.clients import Client
 from sim_twin.wire.d415.images import IMAGE_FAULTS, ImageMaker
-from sim_twin.wire.d415.stream import SERIAL, Description, describe, encode
+from sim_twin.wire.d415.stream import Description, describe, encode
 from sim_twin.wire.faults import FaultInbox, Kind
 from sim_twin.wire.shared_state import Record, poses_dtype
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from robotcell.config import CellConfig
-    from sim_twin.world.world import Visual
+    from sim_twin.visual import Visual
 
 WRONG_SERIAL = "999999999999"
 
@@ -229,12 +229,13 @@ class CameraServer:
 
     def _renderer(self, mode: str) -> Renderer:
         mount = self._mount.model_copy(update={"resolution": mode})
-        T_base_camera = self._options.camera_pose(mount)
-        return Renderer(self._visuals, mount, self._options.noise, self._options.seed, T_base_camera)
+        return Renderer(self._visuals, mount, self._options)
 
     def _describe(self, mode: str) -> Description:
         wrong_serial, _, usb2 = self._replug
-        return describe(MODES[mode], WRONG_SERIAL if wrong_serial else SERIAL, "2.1" if usb2 else "3.2")
+        return describe(
+            reported_intrinsics(mode, self._options), WRONG_SERIAL if wrong_serial else SERIAL, "2.1" if usb2 else "3.2"
+        )
 
 
 class _Stream:

@@ -18,12 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from robotcell.errors import ConnectionLost
 from sim_twin.d415.noise import DEPTH_UNIT_M
-from sim_twin.d415.renderer import FRAMES_PER_S
+from sim_twin.d415.renderer import FRAMES_PER_S, SERIAL
 
 if TYPE_CHECKING:
     from robotcell.interfaces import Intrinsics
-
-SERIAL = "000000000415"
 
 # One that current SDKs take.
 _FIRMWARE = "5.15.1.55"

@@ -23,7 +23,8 @@ from robotcell.interfaces import Intrinsics, RgbdFrame
 from robotcell.motion.executor import Executor
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import JointMove, MotionPlan
-from sim_twin.devices.backend import TwinOptions, open_twin
+from sim_twin.devices.backend import open_twin
+from sim_twin.options import TwinOptions
 from sim_twin.world.held_board import T_flange_board
 
 CONFIG = load_config(

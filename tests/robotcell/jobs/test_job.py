@@ -12,7 +12,6 @@ from policy import make_policy
 from robotcell.cell import Cell, open_cell
 from robotcell.config import CellConfig, Workspace, load_config
 from robotcell.errors import CalibrationError, DeviceFault, GuardTripped, NoTarget
-from robotcell.jobs.decision import Decision
 from robotcell.jobs.job import Report, run_job
 from robotcell.jobs.journal import Journal
 from robotcell.jobs.policy_api import Action, Observation, PickGoal, Uncover
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from robotcell.interfaces import Camera, Gripper, GripperState, RgbdFrame
+    from robotcell.jobs.decision import Decision
     from robotcell.perception.view import View
 
 SCENE = """
@@ -63,7 +63,7 @@ class Scripted:
 
     script: list[Callable[[Observation], Action]]
     name: str = "scripted"
-    workspace: Workspace = Workspace()
+    workspace: Workspace = field(default_factory=Workspace)
     seen: list[Observation] = field(default_factory=list)
 
     def decide(self, observation: Observation) -> Action:
@@ -180,7 +180,7 @@ def test_a_goal_that_is_not_there_ends_the_job_and_lists_what_is(config: CellCon
 
 
 class BlueForRed:
-    """The cell's camera, in whose pictures of some looks, counted from 0, everything red is blue: the goal is hidden."""
+    """The cell's camera. In its pictures of some looks, counted from 0, everything red is blue: the goal is hidden."""
 
     def __init__(self, camera: Camera, looks: set[int]) -> None:
         self._camera, self._looks = camera, looks

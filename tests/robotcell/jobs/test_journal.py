@@ -157,8 +157,8 @@ CREATE TABLE actions (id INTEGER NOT NULL, job_id INTEGER NOT NULL, frame_id INT
 CREATE TABLE outcomes (action_id INTEGER NOT NULL, result VARCHAR NOT NULL, success BOOLEAN NOT NULL, picked VARCHAR,
     detail VARCHAR NOT NULL, peak_force_n FLOAT NOT NULL, ended_s FLOAT NOT NULL, PRIMARY KEY (action_id),
     FOREIGN KEY(action_id) REFERENCES actions (id));
-INSERT INTO jobs VALUES (1, '2026-01-02 03:04:05', NULL, '["red"]', 'learned', '{"table": {"height_m": 0.02}}', 'runs/a',
-    'complete', '', 8.5);
+INSERT INTO jobs VALUES (1, '2026-01-02 03:04:05', NULL, '["red"]', 'learned', '{"table": {"height_m": 0.02}}',
+    'runs/a', 'complete', '', 8.5);
 INSERT INTO frames VALUES (1, 1, 7, 1.0, 'c.png', 'd.png', 0.9, 0.0, 0.0);
 INSERT INTO actions VALUES (1, 1, 1, 'red', 'push', 3, 4, 5, -0.5, 0.1, 0.07, 0.8, 1.5);
 INSERT INTO outcomes VALUES (1, 'pushed', 1, NULL, 'moved', 12.5, 4.0);

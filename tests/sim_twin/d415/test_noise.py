@@ -10,12 +10,12 @@ from sim_twin.d415.noise import (
     DISPARITY_STEP_PX,
     SUBPIXEL_RMS_PX,
     WARM_UP_FRAMES,
-    NoiseOptions,
     degrade_color,
     degrade_depth,
     exposure,
     white_balance,
 )
+from sim_twin.options import NoiseOptions
 
 D415 = Intrinsics(640, 480, 617.3, 617.3, 320.0, 240.0)
 FB = D415.fx * BASELINE_M

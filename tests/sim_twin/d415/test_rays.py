@@ -1,5 +1,3 @@
-import ctypes
-import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,10 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import look_at, transform_points
 from robotcell.interfaces import Intrinsics
-from sim_twin.d415.rays import RayCaster, load_open3d, ray_directions
+from sim_twin.d415.rays import RayCaster, ray_directions
 from tests.sim_twin.boxes import Box, box_at
 
 SMALL = Intrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=24.0)
@@ -66,37 +63,3 @@ def test_poses_of_the_next_frame_move_the_meshes():
     caster = RayCaster([Box((0.2, 0.2, 0.2))], SMALL, look_at((0, 0, 1), (0, 0, 0)))
     assert caster.cast(np.array([box_at(0, 0, 0)])).depth_m[24, 31] == pytest.approx(0.9)
     assert caster.cast(np.array([box_at(0, 0, 0.3)])).depth_m[24, 31] == pytest.approx(0.6)
-
-
-def test_open3d_loads_with_the_libusb_of_the_wheel(monkeypatch):
-    loaded = []
-
-    def without_system_libusb(name, mode=ctypes.DEFAULT_MODE):
-        if name == "libusb-1.0.so.0":
-            raise OSError("no such file")
-        loaded.append((name, mode))
-        return real(name, mode)
-
-    real = ctypes.CDLL
-    monkeypatch.setattr(ctypes, "CDLL", without_system_libusb)
-    monkeypatch.setattr(sys, "platform", "linux")
-    assert hasattr(load_open3d.__wrapped__().t.geometry, "RaycastingScene")
-    name, mode = loaded[0]
-    assert "libusb_package" in name
-    assert mode == ctypes.RTLD_GLOBAL
-
-
-def test_without_any_libusb_the_message_says_what_to_install(monkeypatch):
-    def no_library(name, mode):
-        raise OSError("no such file")
-
-    monkeypatch.setattr(ctypes, "CDLL", no_library)
-    monkeypatch.setattr(sys, "platform", "linux")
-    with pytest.raises(ConfigError, match=r"libusb-1\.0.*robotcell\[twin\]"):
-        load_open3d.__wrapped__()
-
-
-def test_without_open3d_the_message_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(ConfigError, match=r"open3d.*robotcell\[twin\]"):
-        load_open3d.__wrapped__()

@@ -27,10 +27,10 @@ def test_the_flange_is_where_the_kinematics_puts_it():
     cell, world = open_twin(objects=1)
     rng = np.random.default_rng(5)
     with cell.arm:
-        built = world._need()
+        simulation = world.simulation
         for q in rng.uniform(-3, 3, (20, 6)):
             for joint, angle in zip(world.joint_index([f"joint_{i}" for i in range(1, 7)]), q, strict=True):
-                built.engine.resetJointState(built.robot, joint, angle, physicsClientId=built.client)
+                simulation.engine.resetJointState(simulation.robot, joint, angle, physicsClientId=simulation.client)
             np.testing.assert_allclose(world.flange(), ur5e.forward(q), atol=1e-6)
 
 
@@ -139,8 +139,8 @@ def test_a_motion_that_is_kicked_no_longer_stops_on_its_path(cell):
     assert 0.3 < turned < 0.37
 
 
-def test_a_held_block_weighs_on_the_flange(monkeypatch):
-    cell, world = with_block(monkeypatch, "cube", -0.5, 0.0)
+def test_a_held_block_weighs_on_the_flange():
+    cell, world = with_block("cube", -0.5, 0.0)
     with cell.arm, cell.gripper:
         cell.arm.start_joints(joints_at(tool_down(-0.5, 0.0, 0.15)), 1.5, 1.4)
         finish(cell)
@@ -160,11 +160,17 @@ def test_a_held_block_weighs_on_the_flange(monkeypatch):
 def test_an_arm_at_rest_that_is_pushed_away_stops_itself():
     cell, world = open_twin(objects=1)
     with cell.arm:
-        built = world._need()
-        wrist = built.joints[robot_model.ARM_JOINTS[3]]
+        simulation = world.simulation
+        wrist = simulation.joints[robot_model.ARM_JOINTS[3]]
         for _ in range(24):
-            built.engine.applyExternalForce(
-                built.robot, wrist, (0, 0, -1500), (0, 0, 0), built.engine.LINK_FRAME, physicsClientId=built.client
+            engine = simulation.engine
+            engine.applyExternalForce(
+                simulation.robot,
+                wrist,
+                (0, 0, -1500),
+                (0, 0, 0),
+                engine.LINK_FRAME,
+                physicsClientId=simulation.client,
             )
             cell.clock.sleep(1 / 240)
         assert cell.arm.state().mode is ArmMode.PROTECTIVE_STOP

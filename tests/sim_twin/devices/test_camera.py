@@ -5,10 +5,10 @@ import pytest
 from robotcell.config import CameraMount, load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from robotcell.geometry.transforms import invert_transform, look_at, transform_points
-from sim_twin.d415.noise import WARM_UP_FRAMES, NoiseOptions
+from sim_twin.d415.noise import WARM_UP_FRAMES
 from sim_twin.d415.rays import ray_directions
-from sim_twin.devices.backend import TwinOptions
 from sim_twin.devices.camera import TwinCamera
+from sim_twin.options import NoiseOptions, TwinOptions
 from sim_twin.world.world import World
 from tests.sim_twin.boxes import Box, BoxWorld, box_at, table_with_blocks
 
@@ -16,11 +16,11 @@ CLEAN = NoiseOptions(**dict.fromkeys(NoiseOptions.model_fields, False))
 RED = np.array([255, 87, 89], np.uint8)
 
 
-def camera_above(height, resolution="640x480", noise=CLEAN, seed=1, world=None):
+def camera_above(height, resolution="640x480", noise=CLEAN, seed=1, world=None, **options):
     """A camera that looks straight down from `height` on a table with a red block of 50 mm."""
     world = world or BoxWorld([Box((4, 4, 0.1)), Box((0.05,) * 3, RED)], [box_at(0, 0, -0.05), box_at(0, 0, 0.025)])
     mount = CameraMount(resolution=resolution, position=(0, 0, height), look_at=(0, 0, 0))
-    return TwinCamera(world, mount, noise, seed), world
+    return TwinCamera(world, mount, TwinOptions(noise=noise, seed=seed, **options)), world
 
 
 @pytest.mark.parametrize(("resolution", "shape"), [("640x480", (480, 640)), ("1280x720", (720, 1280))])
@@ -46,7 +46,7 @@ def test_a_clean_frame_shows_the_scene_where_it_is(resolution, shape):
 def test_faces_that_turn_away_from_the_lamps_are_darker():
     world = BoxWorld([Box((0.1, 0.1, 0.1), RED)], [box_at(0, 0, 0.05)])
     mount = CameraMount(position=(0.5, 0, 0.5), look_at=(0, 0, 0.05))
-    with TwinCamera(world, mount, CLEAN, 1) as camera:
+    with TwinCamera(world, mount, TwinOptions(noise=CLEAN, seed=1)) as camera:
         frame = camera.read()
         _, visual = camera.render_truth()
     reds = np.unique(frame.color[visual == 0][:, 0])
@@ -86,7 +86,7 @@ def test_connecting_waits_until_exposure_has_settled():
 def test_a_seed_gives_the_same_frames_again():
     images = []
     for seed in (1, 1, 2):
-        camera = TwinCamera(table_with_blocks(), CameraMount(), NoiseOptions(), seed)
+        camera = TwinCamera(table_with_blocks(), CameraMount(), TwinOptions(seed=seed))
         with camera:
             images.append(camera.read())
     np.testing.assert_array_equal(images[0].depth_m, images[1].depth_m)
@@ -132,7 +132,7 @@ def test_a_camera_that_is_not_connected_says_so():
 def test_in_the_twin_things_are_seen_where_the_world_has_them(resolution):
     config = load_config(overrides={"camera.resolution": resolution, "backend.options.seed": 4})
     world = World(config, TwinOptions(seed=4))
-    with TwinCamera(world, config.camera, NoiseOptions(), 4) as camera:
+    with TwinCamera(world, config.camera, TwinOptions(seed=4)) as camera:
         frame = camera.read()
         depth, visual = camera.render_truth()
         seen, objects = world.visuals(), world.objects()
@@ -169,8 +169,41 @@ def test_in_the_twin_things_are_seen_where_the_world_has_them(resolution):
 
 def test_a_world_that_cannot_be_built_leaves_nothing_attached():
     world = World(load_config(), TwinOptions(scene="no such scene"))
-    camera = TwinCamera(world, CameraMount(), CLEAN, 1)
+    camera = TwinCamera(world, CameraMount(), TwinOptions(noise=CLEAN, seed=1))
     with pytest.raises(ConfigError):
         camera.connect()
     with pytest.raises(ConnectionLost):
         camera.read()
+
+
+def test_a_camera_reports_other_intrinsics_than_it_sees_with():
+    (true, _), (wrong, _) = (
+        camera_above(0.9, **options)
+        for options in ({}, {"intrinsics_error": {"focal": 0.01, "cx_px": 3.0, "cy_px": -2.0}})
+    )
+    with true, wrong:
+        seen, reported = true.read(), wrong.read()
+    np.testing.assert_array_equal(reported.color, seen.color)
+    np.testing.assert_array_equal(reported.depth_m, seen.depth_m)
+    a, b = seen.intrinsics, reported.intrinsics
+    assert (b.fx, b.fy) == (pytest.approx(1.01 * a.fx), pytest.approx(1.01 * a.fy))
+    assert (b.cx, b.cy) == (a.cx + 3.0, a.cy - 2.0)
+    assert (b.width, b.height) == (a.width, a.height)
+
+
+def test_a_camera_delivers_depth_that_is_scaled_and_offset():
+    hole = BoxWorld([Box((0.2, 0.2, 0.1), RED)], [box_at(0, 0, -0.05)])
+    (true, _), (wrong, _) = (
+        camera_above(0.9, world=hole, **options)
+        for options in ({}, {"depth_error": {"scale": 1.02, "offset_m": -0.004}})
+    )
+    with true, wrong:
+        seen, off = true.read().depth_m, wrong.read().depth_m
+        truth, _ = wrong.render_truth()
+    there = seen > 0
+    assert 0 < there.mean() < 1
+    np.testing.assert_allclose(off[there], 1.02 * seen[there] - 0.004, atol=1e-6)
+    # Nothing stays nothing, and the truth stays the truth.
+    assert (off[~there] == 0).all()
+    np.testing.assert_allclose(truth[there], seen[there], atol=1e-6)
+    assert off.dtype == np.float32

@@ -5,12 +5,13 @@ from robotcell.geometry import rg2
 from robotcell.geometry.transforms import invert_transform, transform_points
 from sim_twin.devices.gripper import TwinGripper
 from sim_twin.world import robot_model
+from sim_twin.world.bodies import link_poses
 from tests.sim_twin.cells import close_on, finish, go, joints_at, open_twin, tool_down, with_block
 
 
 def tips(world):
     """The corners of the two finger tips' inner faces, in the flange frame: left and right, (4, 3) each."""
-    poses = world._link_poses(world.joint_index((robot_model.LEFT_FINGER, robot_model.RIGHT_FINGER)))
+    poses = link_poses(world.simulation, world.joint_index((robot_model.LEFT_FINGER, robot_model.RIGHT_FINGER)))
     found = []
     for side, T, name in ((1, poses[0], "left_finger"), (-1, poses[1], "right_finger")):
         link = next(link for link in robot_model.links() if link.name == name)
@@ -48,8 +49,8 @@ def test_the_fingers_take_the_time_of_their_speed():
 
 
 @pytest.mark.parametrize("force", [5.0, 20.0, 40.0])
-def test_grips_a_block_with_the_commanded_force(monkeypatch, force):
-    cell, world = with_block(monkeypatch, "cube", -0.5, 0.0)
+def test_grips_a_block_with_the_commanded_force(force):
+    cell, world = with_block("cube", -0.5, 0.0)
     with cell.arm, cell.gripper:
         cell.arm.start_joints(joints_at(tool_down(-0.5, 0.0, 0.15)), 1.5, 1.4)
         finish(cell)
@@ -67,17 +68,17 @@ def test_grips_a_block_with_the_commanded_force(monkeypatch, force):
         assert pressure(world) == 0
 
 
-def test_a_grip_that_loses_its_object_is_no_longer_one(monkeypatch):
-    cell, world = with_block(monkeypatch, "cube", -0.5, 0.0)
+def test_a_grip_that_loses_its_object_is_no_longer_one():
+    cell, world = with_block("cube", -0.5, 0.0)
     with cell.arm, cell.gripper:
         cell.arm.start_joints(joints_at(tool_down(-0.5, 0.0, 0.15)), 1.5, 1.4)
         finish(cell)
         go(cell, tool_down(-0.5, 0.0, 0.015))
         close_on(cell, 0.0, 20.0)
         assert cell.gripper.state().grip_detected
-        built = world._need()
-        built.engine.resetBasePositionAndOrientation(
-            built.bodies[0], (-0.7, 0.2, 0.025), (0, 0, 0, 1), physicsClientId=built.client
+        simulation = world.simulation
+        simulation.engine.resetBasePositionAndOrientation(
+            simulation.bodies[0], (-0.7, 0.2, 0.025), (0, 0, 0, 1), physicsClientId=simulation.client
         )
         cell.clock.sleep(1.0)
         state = cell.gripper.state()
@@ -130,8 +131,8 @@ def test_fingers_that_tremble_on_what_they_grip_are_not_busy():
 
 
 @pytest.mark.parametrize("name", ["cube", "plank", "half_round_slab", "arch", "cylinder"])
-def test_a_block_gripped_in_the_middle_stays_in_the_grip(monkeypatch, name):
-    cell, world = with_block(monkeypatch, name, -0.5, 0.0)
+def test_a_block_gripped_in_the_middle_stays_in_the_grip(name):
+    cell, world = with_block(name, -0.5, 0.0)
     with cell.arm, cell.gripper:
         item, T = world.objects()[0]
         height = (item.shape.mesh.vertices @ T[:3, :3].T)[:, 2].max() + T[2, 3]
@@ -153,9 +154,9 @@ def test_a_block_gripped_in_the_middle_stays_in_the_grip(monkeypatch, name):
 
 def pressure(world):
     """Force [N] of the left finger on what it holds."""
-    built = world._need()
-    finger = built.joints[robot_model.LEFT_FINGER]
-    points = built.engine.getContactPoints(
-        bodyA=built.robot, linkIndexA=finger, bodyB=built.bodies[0], physicsClientId=built.client
+    simulation = world.simulation
+    finger = simulation.joints[robot_model.LEFT_FINGER]
+    points = simulation.engine.getContactPoints(
+        bodyA=simulation.robot, linkIndexA=finger, bodyB=simulation.bodies[0], physicsClientId=simulation.client
     )
     return sum(point[9] for point in points)

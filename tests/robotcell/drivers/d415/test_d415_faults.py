@@ -14,8 +14,8 @@ from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Devices
+from sim_twin.d415.renderer import SERIAL
 from sim_twin.wire.d415.server import FAULTS, WRONG_SERIAL
-from sim_twin.wire.d415.stream import SERIAL
 from sim_twin.wire.faults import Kind
 from tests.robotcell.config.test_calibration_file import values
 from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE, ServedCamera

@@ -7,12 +7,12 @@ import socket
 from typing import TYPE_CHECKING
 
 from robotcell.config import load_config
-from sim_twin.d415.noise import NoiseOptions
+from sim_twin.options import NoiseOptions
+from sim_twin.visual import Visual
 from sim_twin.wire.d415.server import serve_camera
 from sim_twin.wire.d415.stream import Description, Frame, Request, encode, read_message
 from sim_twin.wire.faults import Fault, Kind
 from sim_twin.wire.shared_state import Record, poses_dtype
-from sim_twin.world.world import Visual
 from tests.sim_twin.boxes import table_with_blocks
 
 if TYPE_CHECKING:

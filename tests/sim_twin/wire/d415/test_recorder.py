@@ -7,10 +7,9 @@ from robotcell.config import CameraMount, load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import ConfigError, DeviceFault
-from sim_twin.d415.renderer import MODES
+from sim_twin.d415.renderer import MODES, SERIAL
 from sim_twin.devices.backend import open_twin
 from sim_twin.wire.d415.recorder import record
-from sim_twin.wire.d415.stream import SERIAL
 from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE
 
 FRAMES = 8

@@ -10,8 +10,8 @@ import psutil
 import pytest
 
 from robotcell.errors import ConnectionLost
-from sim_twin.d415.noise import NoiseOptions
 from sim_twin.d415.renderer import MODES, Renderer
+from sim_twin.options import NoiseOptions, TwinOptions
 from sim_twin.wire.faults import Kind
 from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE, RawClient, ServedCamera
 
@@ -42,7 +42,7 @@ def lift_faults(request):
 def truth(served, resolution):
     mount = served.config.camera.model_copy(update={"resolution": resolution})
     noise = NoiseOptions(**served.config.backend.options["noise"])
-    renderer = Renderer(served.visuals, mount, noise, 0)
+    renderer = Renderer(served.visuals, mount, TwinOptions(noise=noise))
     hits = renderer.cast(served.poses)
     return hits.depth_m, renderer.color(hits)
 

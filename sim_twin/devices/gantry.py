@@ -7,7 +7,6 @@ from the same state, since a state can be saved and put back.
 
 from __future__ import annotations
 
-import enum
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,17 +15,25 @@ import numpy as np
 
 from robotcell.geometry import rg2
 from robotcell.geometry.transforms import invert_transform
+from robotcell.motion.executor import Ending
 from robotcell.motion.tool import tool_down
 from sim_twin.devices.gripper import TwinGripper
 from sim_twin.devices.trajectory import trapezoid
 from sim_twin.world import robot_model
-from sim_twin.world.world import STEP_S, Friction, Visual, World, quaternion
+from sim_twin.world.bodies import is_at_rest, put_body, put_to_sleep, quaternion
+from sim_twin.world.settling import is_in_workspace
+from sim_twin.world.simulation import STEP_S
+from sim_twin.world.world import World
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
-    from sim_twin.devices.backend import TwinOptions
+    from sim_twin.options import TwinOptions
     from sim_twin.scenes.scene import Scene
+    from sim_twin.world.bodies import Friction
+    from sim_twin.world.simulation import Simulation
 
 # Of the motor that stands in for the arm; an arm gives way at about this force at its tool.
 _SLIDE_FORCE_N = 200.0
@@ -50,41 +57,38 @@ _AWAY = (5.0, 5.0, -1.0)
 _T_TCP_FLANGE = invert_transform(rg2.T_FLANGE_TCP)
 
 
-class Ending(enum.IntEnum):
-    """How an attempt went."""
-
-    HELD = 0
-    EMPTY = 1  # the fingers closed on nothing
-    LOST = 2  # gripped, but no longer held after lift and swing
-    COLLIDED = 3  # something was in the way of the fingers
-    PUSHED = 4
-
-
 @dataclass(frozen=True)
 class Attempt:
-    """What an attempt came to; `held` are the indices of the objects that rose with the fingers."""
+    """What an attempt came to.
+
+    Attributes:
+        ending: DONE, CONTACT when something was in the way of the fingers, EMPTY when they closed on nothing.
+        held: indices of the objects that are held at the end of a grasp; none where what was gripped got lost.
+    """
 
     ending: Ending
     held: tuple[int, ...] = ()
 
 
-class RigWorld(World):
-    """A world whose machine is the gripper on slides, parked out of sight between attempts.
+class GantryGripper:
+    """The gripper on two slides, in a world of its own; it is parked out of sight between attempts.
 
     Args:
         config: of the cell.
-        options: of the twin; the scene and its seed are taken from `scene` instead.
+        options: of the twin; the scene is taken from `scene` instead.
         scene: what stands on the table.
         friction: of objects and table.
     """
 
     def __init__(self, config: CellConfig, options: TwinOptions, scene: Scene, friction: Friction) -> None:
-        super().__init__(config, options, friction)
-        self._scene = scene
-        self._gripper = TwinGripper(self)
+        self.config = config
+        self.world = World(config, options, friction, robot_model.gantry_machine(), scene)
+        self._gripper = TwinGripper(self.world)
         self._taken: set[int] = set()
         self._slides: list[int] = []
         self._fingers: dict[int, str] = {}
+        # Where the slides are: along, down [m].
+        self._at = (0.0, 0.0)
 
     def connect(self) -> None:
         """Build the world and park the gripper.
@@ -93,16 +97,21 @@ class RigWorld(World):
             ConfigError: the scene does not come to rest in the workspace.
         """
         self._gripper.connect()
-        self._slides = self.joint_index((robot_model.SLIDE_X, robot_model.SLIDE_Z))
+        self._slides = self.world.joint_index((robot_model.SLIDE_X, robot_model.SLIDE_Z))
         names = tuple(robot_model.finger_angles(0.0))
-        self._fingers = dict(zip(self.joint_index(names), names, strict=True))
+        self._fingers = dict(zip(self.world.joint_index(names), names, strict=True))
         self._taken = set()
         self._park()
+
+    def close(self) -> None:
+        """End the world. Idempotent."""
+        self._gripper.close()
+        self.world.close()
 
     @property
     def present(self) -> list[int]:
         """Indices of the objects that are still on the table."""
-        return [i for i in range(len(self._need().bodies)) if i not in self._taken]
+        return [i for i in range(len(self.world.simulation.bodies)) if i not in self._taken]
 
     def grasp(self, x: float, y: float, theta: float, near_z: float, tcp_z: float) -> Attempt:
         """Come down at (x, y), close along theta, lift and swing.
@@ -117,10 +126,10 @@ class RigWorld(World):
         use = self.config.gripper
         self._place(x, y, near_z, theta, use.preshape_m)
         if not self._slide(0.0, near_z - tcp_z, _GUARDED_SPEED_M_S, guarded=True):
-            return Attempt(Ending.COLLIDED)
+            return Attempt(Ending.CONTACT)
         self._gripper.start_width(rg2.MIN_WIDTH_M, use.force_n)
         for _ in range(_FINGERS_STEPS):
-            self.step()
+            self.world.step()
             if not self._gripper.state().busy:
                 break
         if self._gripper.state().width_m < use.empty_width_m:
@@ -131,83 +140,70 @@ class RigWorld(World):
         rose = self._heights() - heights
         held = tuple(int(i) for i in np.flatnonzero(rose > _HELD_SHARE * _LIFT_M))
         lost = self._gripper.state().width_m < use.empty_width_m or not held
-        return Attempt(Ending.LOST, held) if lost else Attempt(Ending.HELD, held)
+        return Attempt(Ending.DONE, () if lost else held)
 
     def push(self, start: tuple[float, float], theta: float, length_m: float, near_z: float, tcp_z: float) -> Attempt:
         """Come down at start (x, y) with closed fingers and move by `length_m` along theta; arguments as in `grasp`."""
         self._place(*start, near_z, theta, rg2.MIN_WIDTH_M)
         if not self._slide(0.0, near_z - tcp_z, _GUARDED_SPEED_M_S, guarded=True):
-            return Attempt(Ending.COLLIDED)
+            return Attempt(Ending.CONTACT)
         self._slide(length_m, near_z - tcp_z, _GUARDED_SPEED_M_S, guarded=True)
-        return Attempt(Ending.PUSHED)
+        return Attempt(Ending.DONE)
 
     def withdraw(self) -> None:
         """Take the gripper away and let the objects come to rest."""
         self._park()
+        simulation = self.world.simulation
         for _ in range(_SETTLES):
-            self.step(_SETTLE_STEPS)
-            if all(self._at_rest(self._need().bodies[i]) for i in self.present):
+            self.world.step(_SETTLE_STEPS)
+            if all(is_at_rest(simulation, simulation.bodies[i]) for i in self.present):
                 break
 
     def take(self, indices: tuple[int, ...]) -> None:
         """Remove objects from the table."""
-        built = self._need()
+        simulation = self.world.simulation
         for i in indices:
             if i not in self._taken:
                 self._taken.add(i)
                 x, y, z = _AWAY
-                self._move(built.bodies[i], (x + 0.3 * i, y, z), (0.0, 0.0, 0.0, 1.0))
+                _move(simulation, simulation.bodies[i], (x + 0.3 * i, y, z), (0.0, 0.0, 0.0, 1.0))
 
     def drop_outs(self) -> tuple[int, ...]:
         """Objects that left the workspace or fell off the table."""
-        return tuple(i for i in self.present if not self._in_workspace(self._need().bodies[i]))
+        simulation, config = self.world.simulation, self.config
+        return tuple(i for i in self.present if not is_in_workspace(simulation, simulation.bodies[i], config))
 
     def save(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
         """Where every object is; they are taken to be at rest."""
-        built = self._need()
-        return [built.engine.getBasePositionAndOrientation(b, physicsClientId=built.client) for b in built.bodies]
+        simulation = self.world.simulation
+        place_of, client = simulation.engine.getBasePositionAndOrientation, simulation.client
+        return [place_of(body, physicsClientId=client) for body in simulation.bodies]
 
     def restore(self, saved: list[tuple[tuple[float, ...], tuple[float, ...]]]) -> None:
         """Put every object back to where it was, at rest and asleep, and park the gripper."""
-        built = self._need()
+        simulation = self.world.simulation
         self._park()
-        for body, (position, turn) in zip(built.bodies, saved, strict=True):
-            now = built.engine.getBasePositionAndOrientation(body, physicsClientId=built.client)
+        for body, (position, turn) in zip(simulation.bodies, saved, strict=True):
+            now = simulation.engine.getBasePositionAndOrientation(body, physicsClientId=simulation.client)
             if now != (position, turn):
-                self._move(body, position, turn)
+                _move(simulation, body, position, turn)
         self._taken = {i for i in self._taken if saved[i][0][2] < 0 and saved[i][0][0] > 1}
-
-    def _make_scene(self) -> Scene:
-        return self._scene
-
-    def _load_robot(self, _table: int) -> None:
-        self._load_machine(robot_model.rig_urdf(), {})
-
-    def _robot_visuals(self) -> list[tuple[Visual, tuple[str, int]]]:
-        # Parked wherever the camera looks.
-        return []
-
-    def _move(self, body: int, position: tuple[float, ...], turn: tuple[float, ...]) -> None:
-        built = self._need()
-        built.engine.resetBasePositionAndOrientation(body, position, turn, physicsClientId=built.client)
-        built.engine.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=built.client)
-        self._put_to_sleep(body)
 
     def _park(self) -> None:
         self._place(0.0, 0.0, _PARKED_Z, 0.0, self.config.gripper.preshape_m)
 
     def _place(self, x: float, y: float, z: float, theta: float, width_m: float) -> None:
         """Put the gripper somewhere at once, its fingers so far open."""
-        built = self._need()
-        p, client = built.engine, built.client
+        simulation = self.world.simulation
+        p, client = simulation.engine, simulation.client
         T_base_flange = tool_down(x, y, z, theta) @ _T_TCP_FLANGE
         position = T_base_flange[:3, 3].tolist()
-        p.resetBasePositionAndOrientation(built.robot, position, quaternion(T_base_flange), physicsClientId=client)
+        p.resetBasePositionAndOrientation(simulation.robot, position, quaternion(T_base_flange), physicsClientId=client)
         angles = robot_model.finger_angles(rg2.crank_angle(width_m))
         for joint, name in self._fingers.items():
-            p.resetJointState(built.robot, joint, angles[name], physicsClientId=client)
+            p.resetJointState(simulation.robot, joint, angles[name], physicsClientId=client)
         for joint in self._slides:
-            p.resetJointState(built.robot, joint, 0.0, physicsClientId=client)
+            p.resetJointState(simulation.robot, joint, 0.0, physicsClientId=client)
         self._drive(0.0, 0.0)
         self._gripper.stop()
         self._at = (0.0, 0.0)
@@ -220,9 +216,9 @@ class RigWorld(World):
         for i, s in enumerate(trapezoid(distance, speed_m_s, self.config.motion.linear_acceleration_m_s2, STEP_S)):
             x, z = start + way * (s / distance)
             self._drive(float(x), float(z))
-            self.step()
+            self.world.step()
             # The executor looks at the force every 8 ms, which is every second step.
-            if guarded and i % 2 and math.hypot(*self.contact().robot_force) > limit:
+            if guarded and i % 2 and math.hypot(*self.world.contact().robot_force) > limit:
                 return False
         self._at = (along, down)
         return True
@@ -232,12 +228,16 @@ class RigWorld(World):
             # Begins and ends at rest.
             along = _SWING_M * 0.5 * (1 - math.cos(2 * math.pi * i * STEP_S / _SWING_S))
             self._drive(along, down)
-            self.step()
+            self.world.step()
 
     def _drive(self, along: float, down: float) -> None:
-        self.drive_positions(self._slides, (along, down), (_SLIDE_FORCE_N,) * 2, (_GAIN,) * 2)
+        self.world.drive_positions(self._slides, (along, down), (_SLIDE_FORCE_N,) * 2, (_GAIN,) * 2)
 
     def _heights(self) -> Array:
-        built = self._need()
-        poses = [built.engine.getBasePositionAndOrientation(b, physicsClientId=built.client) for b in built.bodies]
-        return np.array([position[2] for position, _ in poses])
+        return np.array([position[2] for position, _ in self.save()])
+
+
+def _move(simulation: Simulation, body: int, position: Sequence[float], turn: Sequence[float]) -> None:
+    """Put an object somewhere at once, asleep."""
+    put_body(simulation, body, position, turn)
+    put_to_sleep(simulation, body)
