@@ -14,7 +14,7 @@ ADDRESS, VALUE = 2, 3
 
 
 class Bench:
-    """The units of a box, and the two records between them and a world."""
+    """The units of a Compute Box, and the two records between them and a world."""
 
     def __init__(self):
         self.command, self.state = Record(GRIPPER_COMMAND), Record(CELL_STATE)
@@ -178,7 +178,7 @@ def test_a_switch_that_is_pushed_at_power_on_is_a_safety_error(bench):
     assert bench.read(268) == 0
 
 
-def test_the_box_takes_nothing_but_a_power_cycle(bench):
+def test_the_compute_box_takes_nothing_but_a_power_cycle(bench):
     assert bench.refused(63, 0, [1]) == VALUE
     assert bench.refused(63, 1, [2]) == ADDRESS
     assert bench.units.read(63, 0, 1) == [0]
