@@ -8,6 +8,7 @@ from multiprocessing.shared_memory import SharedMemory
 
 import pytest
 
+from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.control import handle
