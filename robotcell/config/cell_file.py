@@ -33,7 +33,7 @@ def load_config(
     Args:
         path: a TOML file; None for the twin with its defaults.
         overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
-        said_as: what the user wrote before the value of an override (`--seed `), by dotted key, for the words of errors.
+        said_as: what the user wrote before an override's value (`--seed `), by dotted key, for the words of errors.
 
     Raises:
         ConfigError: naming every bad key at once, each with its value and what is allowed.
