@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,25 +10,24 @@ from rich.table import Table
 from rich.text import Text
 
 from calibration.verify import HOVER_M, Verification, verify
-from cli.console import progress, report_error, results
+from cli.console import print_json, progress, report_error, results
 from robotcell.cell import open_cell
-from robotcell.config import CellConfig, load_config
 from robotcell.errors import CalibrationError, CellError
 from robotcell.motion.config_check import check_config
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
+    from cli.options import CellChoice
+    from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
 
 _NOT_GOOD = 1
 _TWIN = "twin"
 
 
-def run_verify(cell_file: Path | None, points: int, *, touch: bool, yes: bool, as_json: bool) -> int:
+def run_verify(cell_choice: CellChoice, points: int, *, touch: bool, yes: bool, as_json: bool) -> int:
     """Run the command; returns the exit code."""
     try:
-        config = load_config(cell_file)
+        config = cell_choice.load()
         check_config(config)
         alone = yes or config.backend.name == _TWIN
         with open_cell(config) as cell:
@@ -42,13 +39,13 @@ def run_verify(cell_file: Path | None, points: int, *, touch: bool, yes: bool, a
                 hovering=lambda number, count, spot: _stand_over(number, count, spot, wait=not alone),
             )
     except CalibrationError as error:
-        report_error(error)
+        report_error(error, as_json=as_json)
         return _NOT_GOOD
     except CellError as error:
-        return report_error(error)
+        return report_error(error, as_json=as_json)
     problems = verification.problems(config)
     if as_json:
-        sys.stdout.write(json.dumps(_plain(verification, problems)) + "\n")
+        print_json(_plain(verification, problems))
     else:
         _print(verification, problems, config)
     return _NOT_GOOD if problems else 0

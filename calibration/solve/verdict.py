@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.solve.rigid import log
+from calibration.solve.se3 import log
 
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
