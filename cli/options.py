@@ -78,7 +78,17 @@ class CellChoice:
         Raises:
             ConfigError: something is wrong in one of them, named as the user gave it.
         """
-        from robotcell.config import load_config, parse_setting
+        from robotcell.config import load_config
+
+        return load_config(self.file, *self.overrides())
+
+    def overrides(self) -> tuple[dict[str, object], dict[str, str]]:
+        """The values above the file, and how the user gave each, by dotted key.
+
+        Raises:
+            ConfigError: a value of --set is no KEY=VALUE.
+        """
+        from robotcell.config import parse_setting
 
         overrides: dict[str, object] = {}
         said_as: dict[str, str] = {}
@@ -89,4 +99,4 @@ class CellChoice:
             if value is not None:
                 key = _KEYS[option]
                 overrides[key], said_as[key] = value, f"{option} "
-        return load_config(self.file, overrides, said_as)
+        return overrides, said_as
