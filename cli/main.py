@@ -43,7 +43,7 @@ def _version(value: bool) -> None:
 
 
 @app.callback()
-def robotcell(
+def main_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,

@@ -94,9 +94,9 @@ class CellChoice:
         said_as: dict[str, str] = {}
         for text in self.settings or []:
             key, value = parse_setting(text)
-            overrides[key], said_as[key] = value, f"--set {key}"
+            overrides[key], said_as[key] = value, f"--set {key}="
         for option, value in self.options.items():
             if value is not None:
                 key = _KEYS[option]
-                overrides[key], said_as[key] = value, option
+                overrides[key], said_as[key] = value, f"{option} "
         return overrides, said_as

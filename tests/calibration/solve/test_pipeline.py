@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calibration.solve.depth import fit_depth
-from calibration.solve.readers.records import read_file
-from calibration.solve.rigid import difference, exp, invert
-from calibration.solve.solver import solve
+from calibration.solve.depth_correction import fit_depth
+from calibration.solve.pipeline import solve
+from calibration.solve.readers.view_file import read_file
+from calibration.solve.se3 import difference, exp, invert
 from calibration.solve.verdict import Reason
 from calibration.solve.views import Corners, Views
 from robotcell.geometry.transforms import make_transform, rotation_angle

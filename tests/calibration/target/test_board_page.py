@@ -4,19 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.target.board import (
-    DEFAULT_BOARD,
-    MARGIN_M,
-    bolted_to_flange,
-    draw_plate,
-    held_by_gripper,
-    plate_corners,
-    save_page,
-)
+from calibration.target.board_page import save_page
 from calibration.target.detection import Detector
-from robotcell.errors import ConfigError
+from calibration.target.held_board import bolted_to_flange
+from robotcell.errors import ConfigError, StorageError
 from robotcell.geometry import rg2
 from robotcell.geometry.transforms import check_transform, transform_points
+from robotcell.perception.board_plate import DEFAULT_BOARD, MARGIN_M, draw_plate, held_by_gripper, plate_corners
 
 
 def test_the_drawn_board_has_its_corners_where_the_layout_says():
@@ -55,7 +49,7 @@ def test_a_board_that_cannot_be_printed_is_refused(tmp_path, change, words):
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ConfigError, match="nowhere"):
+    with pytest.raises(StorageError, match="nowhere"):
         save_page(DEFAULT_BOARD, tmp_path / "nowhere" / "board.pdf")
 
 

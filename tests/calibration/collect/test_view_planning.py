@@ -1,15 +1,17 @@
 import numpy as np
 import pytest
 
-from calibration.collect.planning import HeldBoard, plan_views, plan_ways, visible
+from calibration.collect.board_motion import plan_motions
+from calibration.collect.view_planning import plan_views, visible
 from calibration.solve.verdict import MIN_ROTATION_DEG, rotation_spread_deg
-from calibration.target.board import DEFAULT_BOARD, held_by_gripper
+from calibration.target.held_board import HeldBoard
 from robotcell.config import load_config
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import ur5e
 from robotcell.geometry.transforms import invert_transform, transform_points
 from robotcell.motion.path_check import check_path
 from robotcell.motion.tool import TALLEST_OBJECT_M
+from robotcell.perception.board_plate import DEFAULT_BOARD, held_by_gripper
 from sim_twin.d415.renderer import MODES
 
 CONFIG = load_config(None, {"camera.resolution": "1280x720"})
@@ -39,7 +41,6 @@ def test_the_camera_sees_the_whole_board_in_every_view(views):
 
 def test_views_differ_in_depth_and_turn_about_all_axes(views):
     T = seen_at(views)
-    assert np.ptp(transform_points(T[0], HELD.center)) > 0
     depths = [transform_points(view, HELD.center)[2] for view in T]
     assert np.ptp(depths) > 0.10
     spread = rotation_spread_deg(ur5e.forward(np.array(views.views)))
@@ -49,19 +50,19 @@ def test_views_differ_in_depth_and_turn_about_all_axes(views):
 def test_every_way_is_safe_and_keeps_the_board_over_what_may_stand_on_the_table(views):
     q = HOME
     for target in views.views:
-        for way in plan_ways("way", q, target, views.hub, HELD, CONFIG):
-            check_path(way.plan, CONFIG)
-            goal = way.plan.steps[-1].q
+        for motion in plan_motions("way", q, target, views.q_via, HELD, CONFIG):
+            check_path(motion.plan, CONFIG)
+            goal = motion.plan.steps[-1].q
             for share in np.linspace(0, 1, 12):
-                T = ur5e.forward(way.plan.q_start + share * (goal - way.plan.q_start))
+                T = ur5e.forward(motion.plan.q_start + share * (goal - motion.plan.q_start))
                 assert transform_points(T, HELD.points)[:, 2].min() > TALLEST_OBJECT_M
             q = goal
         assert np.array_equal(q, target)
 
 
 def test_a_seed_plans_the_same_views_again_and_another_plans_others():
-    again, other = plan(count=4), plan(count=4, seed=2)
-    np.testing.assert_array_equal(again.views, plan(count=4).views)
+    again, other = plan(count=2), plan(count=2, seed=2)
+    np.testing.assert_array_equal(again.views, plan(count=2).views)
     assert not np.array_equal(again.views, other.views)
 
 
@@ -82,4 +83,4 @@ def test_a_camera_that_looks_away_is_refused_with_what_stood_in_the_way():
 def test_a_board_that_would_hit_something_is_refused():
     low = np.array([-0.0371, -1.2, 2.0, -0.8, 0.0, 0.7])
     with pytest.raises(UnsafeMotion):
-        plan_ways("down", HOME, low, HOME, HELD, CONFIG)
+        plan_motions("down", HOME, low, HOME, HELD, CONFIG)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from calibration.solve.rigid import difference
+from calibration.solve.se3 import difference
 from cli.main import app
 from robotcell.config import load_config
 from robotcell.config.calibration_file import load_calibration
@@ -40,7 +40,7 @@ def write_cell(folder, name="cell.toml", camera="", offset=OFFSET):
 def calibrated(tmp_path_factory):
     """A cell that was calibrated with a few more views than are needed, and what the command said."""
     folder = tmp_path_factory.mktemp("cell")
-    done = run("calibrate", "--cell", write_cell(folder), "--views", 15, "--seed", 3, "--out", folder / "camera.json")
+    done = run("calibrate", "--cell", write_cell(folder), "--views", 14, "--seed", 3, "--out", folder / "camera.json")
     return folder, done
 
 
@@ -69,7 +69,7 @@ def test_going_on_with_a_session_that_is_complete_only_solves_again(calibrated):
     (session,) = (folder / "runs" / "calibration").iterdir()
     before = sorted(path.name for path in (session / "views").iterdir())
     cell = folder / "cell.toml"
-    again = run("calibrate", "--cell", cell, "--views", 15, "--resume", session, "--out", folder / "again.json")
+    again = run("calibrate", "--cell", cell, "--views", 14, "--resume", session, "--out", folder / "again.json")
     assert again.exit_code == 0, again.output
     assert sorted(path.name for path in (session / "views").iterdir()) == before
     np.testing.assert_allclose(
@@ -95,7 +95,9 @@ def test_without_the_calibration_the_same_cell_is_refused(calibrated):
     folder, _ = calibrated
     done = run("calibrate", "verify", "--cell", folder / "cell.toml", "--json")
     assert done.exit_code == 1
-    assert "table" in done.output
+    error = json.loads(done.stdout)
+    assert error["code"] == "calibration"
+    assert "table" in error["error"]
 
 
 def test_a_camera_that_was_moved_since_stops_the_job_before_anything_moves(calibrated):
@@ -123,6 +125,7 @@ def test_a_calibration_of_another_mode_of_the_camera_is_refused(calibrated):
         (["--marker-mm", "40"], "marker_m must be below square_m"),
         (["--square-mm", "29"], "the twin holds the default board"),
         (["--resume", "nowhere"], "no session folder"),
+        (["--set", "table.colour=1"], "--set table.colour"),
     ],
 )
 def test_wrong_usage_is_refused_before_anything_moves(tmp_path, arguments, words):

@@ -1,4 +1,4 @@
-"""Two time series with clocks of their own: poses of the flange, and poses of the board as the camera saw it.
+"""The offset between the clocks of two time series: poses of the flange, and of the board as the camera saw it.
 
 Both turn by the same angle over the same interval, wherever camera and board are mounted. So the offset between the
 clocks is first where these angles agree best, and is then refined together with the hand-eye transforms.
@@ -6,31 +6,25 @@ clocks is first where these angles agree best, and is then refined together with
 
 from __future__ import annotations
 
-import csv
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from calibration.solve.consensus import find_consensus
 from calibration.solve.handeye import predict
-from calibration.solve.rigid import change, difference, invert
+from calibration.solve.se3 import change, difference, invert
+from calibration.solve.time_series import Series
 from calibration.solve.views import Views
-from robotcell.errors import CalibrationError, ConfigError
+from robotcell.errors import CalibrationError
 
 if TYPE_CHECKING:
     from datetime import datetime
-    from pathlib import Path
 
     from robotcell.config.calibration_file import Mount
     from robotcell.geometry.transforms import Array
 
-_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-_MIN_ROWS = 12
-_QUATERNION_TOLERANCE = 0.02
 # The first search: so many intervals of about so long, on a grid of so many offsets at most.
 _INTERVALS = 200
 _INTERVAL_S = 0.5
@@ -47,79 +41,6 @@ _SAME_M, _SAME_RAD = 0.005, float(np.deg2rad(1.0))
 _MAX_VIEWS = 200
 # The flange's pose is not interpolated across a longer gap in which it moved.
 _MAX_GAPS = 3.0
-
-
-@dataclass(frozen=True)
-class Series:
-    """Poses over time.
-
-    Attributes:
-        t: (N,) growing [s].
-        T: (N, 4, 4).
-    """
-
-    t: Array
-    T: Array
-
-    @cached_property
-    def _turning(self) -> Slerp:
-        return Slerp(self.t, Rotation.from_matrix(self.T[:, :3, :3]))
-
-    def at(self, t: Array) -> Array:
-        """(M, 4, 4) poses at times within the series: position along the chord, rotation by slerp."""
-        inside = np.clip(t, self.t[0], self.t[-1])
-        T = np.tile(np.eye(4), (len(inside), 1, 1))
-        T[:, :3, :3] = self._turning(inside).as_matrix()
-        for axis in range(3):
-            T[:, axis, 3] = np.interp(inside, self.t, self.T[:, axis, 3])
-        return T
-
-
-def read_series(path: Path) -> Series:
-    """Read a CSV file with the columns t,x,y,z,qx,qy,qz,qw: seconds, metres, quaternion with its scalar last.
-
-    A first line with the names of the columns is optional and may order them otherwise.
-
-    Raises:
-        ConfigError: naming the file, the line and what is wrong.
-    """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [
-                (number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)
-            ]
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: not a CSV file: {error}") from error
-    order = list(range(len(_COLUMNS)))
-    if rows and not _is_number(rows[0][1][0]):
-        names = [cell.strip().lstrip("#").strip() for cell in rows[0][1]]
-        missing = [column for column in _COLUMNS if column not in names]
-        if missing:
-            raise ConfigError(
-                f"{path}: line {rows[0][0]}: no column {', '.join(missing)}; needed: {','.join(_COLUMNS)}"
-            )
-        order = [names.index(column) for column in _COLUMNS]
-        rows = rows[1:]
-    values = np.array([_numbers(row, order, f"{path}: line {number}") for number, row in rows]).reshape(-1, 8)
-    if len(values) < _MIN_ROWS:
-        raise ConfigError(f"{path}: {len(values)} poses; at least {_MIN_ROWS} are needed")
-    backwards = np.flatnonzero(np.diff(values[:, 0]) <= 0)
-    if len(backwards):
-        raise ConfigError(f"{path}: line {rows[backwards[0] + 1][0]}: t does not grow")
-    norms = np.linalg.norm(values[:, 4:], axis=1)
-    wrong = np.flatnonzero(np.abs(norms - 1) > _QUATERNION_TOLERANCE)
-    if len(wrong):
-        raise ConfigError(
-            f"{path}: line {rows[wrong[0]][0]}: qx,qy,qz,qw has length {norms[wrong[0]]:.3f}; a rotation has 1"
-        )
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3, :3] = Rotation.from_quat(values[:, 4:]).as_matrix()
-    T[:, :3, 3] = values[:, 1:4]
-    return Series(values[:, 0], T)
 
 
 def align(flange: Series, board: Series, mount: Mount, date: datetime) -> Views:
@@ -253,22 +174,3 @@ def _quaternions(T: Array) -> Array:
 def _angles(q_a: Array, q_b: Array) -> Array:
     """Angles (...) [rad] between unit quaternions (..., 4)."""
     return np.asarray(2 * np.arccos(np.clip(np.abs((q_a * q_b).sum(axis=-1)), 0.0, 1.0)))
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(row: list[str], order: list[int], place: str) -> list[float]:
-    if len(row) <= max(order):
-        raise ConfigError(f"{place}: {len(row)} columns; needed: {','.join(_COLUMNS)}")
-    numbers = []
-    for column, index in zip(_COLUMNS, order, strict=True):
-        if not _is_number(row[index]) or not np.isfinite(float(row[index])):
-            raise ConfigError(f"{place}: {column}: {row[index].strip()!r} is not a number")
-        numbers.append(float(row[index]))
-    return numbers

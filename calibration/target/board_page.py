@@ -1,44 +1,19 @@
-"""The calibration board on the flange, and a page to print; its plate is in `robotcell.perception.board_plate`."""
+"""The calibration board as a page to print, with a ruler and what to measure."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from robotcell.errors import ConfigError
-from robotcell.geometry.transforms import Array, make_transform
-from robotcell.perception.board_plate import (
-    DEFAULT_BOARD,
-    MARGIN_M,
-    PLATE_M,
-    TAB_M,
-    draw_plate,
-    held_by_gripper,
-    opencv_board,
-    plate_corners,
-    size_m,
-)
+from robotcell.io.atomic_file import replaced
+from robotcell.perception.board_plate import draw_plate
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from robotcell.config.calibration_file import CharucoBoard
-
-__all__ = [
-    "DEFAULT_BOARD",
-    "MARGIN_M",
-    "PLATE_M",
-    "TAB_M",
-    "bolted_to_flange",
-    "draw_plate",
-    "held_by_gripper",
-    "opencv_board",
-    "plate_corners",
-    "save_page",
-    "size_m",
-]
 
 # 762 dpi: a tenth of a millimetre is three pixels, so squares and markers of whole tenths have sharp edges.
 _PX_PER_MM = 30
@@ -50,12 +25,6 @@ _FOOT_MM = 34.0
 _TEXT_MM = 3.2
 
 
-def bolted_to_flange(board: CharucoBoard) -> Array:
-    """T_flange_board (4, 4) of a plate bolted flat to the flange in place of the gripper, its rows along flange x."""
-    width, height = size_m(board)
-    return make_transform(np.diag([1.0, -1.0, -1.0]), (-width / 2, height / 2, PLATE_M))
-
-
 def save_page(board: CharucoBoard, path: Path) -> str:
     """Write a page to print, with a ruler and what to measure; A4, or A3 where the board needs it.
 
@@ -63,7 +32,8 @@ def save_page(board: CharucoBoard, path: Path) -> str:
         The paper's name.
 
     Raises:
-        ConfigError: the board fits on neither, or the file cannot be written.
+        ConfigError: the board fits on neither.
+        StorageError: the file cannot be written.
     """
     plate = draw_plate(board, _PX_PER_MM)
     height, width = plate.shape
@@ -84,10 +54,8 @@ def save_page(board: CharucoBoard, path: Path) -> str:
     draw = ImageDraw.Draw(page)
     draw.rectangle((left, top, left + width - 1, top + height - 1), outline=0, width=_px(0.1))
     _draw_foot(draw, board, left, top + height)
-    try:
-        page.save(path, "PDF", resolution=_DPI, title="robotcell calibration board")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from error
+    with replaced(path) as part:
+        page.save(part, "PDF", resolution=_DPI, title="robotcell calibration board")
     return fitting[0]
 
 

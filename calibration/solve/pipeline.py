@@ -9,22 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.solve.board_pose import MIN_CORNERS, start_poses, usable_corners
-from calibration.solve.candidates import (
-    Candidate,
-    best_of,
-    find_candidates,
-    fit_with_free_scale,
-    lever_m,
-    look,
-    moved_arm,
-)
 from calibration.solve.consensus import find_consensus
-from calibration.solve.depth import fit_depth
+from calibration.solve.depth_correction import fit_depth
 from calibration.solve.handeye import Fit, predict
 from calibration.solve.mistakes import find_mistake, find_partial_shift
+from calibration.solve.model_selection import (
+    Candidate,
+    best_of,
+    fit_candidates,
+    fit_with_free_scale,
+    moved_arm,
+)
+from calibration.solve.observations import observe_board
 from calibration.solve.projection import intrinsics_vector, stack_corners
-from calibration.solve.series import Series, align
 from calibration.solve.solution import Estimate, Solution, ViewErrors
+from calibration.solve.time_alignment import align
 from calibration.solve.verdict import (
     MAX_HELD_OUT_DEG,
     MIN_USED_SHARE,
@@ -45,7 +44,8 @@ from robotcell.geometry.transforms import make_transform
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from calibration.solve.depth import DepthFit
+    from calibration.solve.depth_correction import DepthFit
+    from calibration.solve.time_series import Series
     from robotcell.config.calibration_file import CameraModel, Mount
     from robotcell.geometry.transforms import Array
 
@@ -103,16 +103,16 @@ def solve_series(flange: Series, board: Series, mount: Mount) -> Solution:
 
 def _solve_usable(views: Views, refine_intrinsics: bool) -> tuple[Verdict, Estimate | None, tuple[ViewErrors, ...]]:
     M, on_the_arm = views.T_parent_child, views.mount == "fixed"
-    sight = look(views)
-    as_given = find_consensus(M, sight.T_camera_board, free_scale=True)
-    mistake = find_mistake(M, sight.T_camera_board, on_the_arm, as_given)
+    observed = observe_board(views)
+    as_given = find_consensus(M, observed.T_camera_board, free_scale=True)
+    mistake = find_mistake(M, observed.T_camera_board, on_the_arm, as_given)
     if mistake:
         return mistake, None, tuple(ViewErrors(name, used=True) for name in views.names)
-    candidates = find_candidates(views, M, sight, on_the_arm, refine_intrinsics)
+    candidates = fit_candidates(views, M, observed, on_the_arm, refine_intrinsics)
     best = best_of(candidates if refine_intrinsics else [each for each in candidates if not each.refined])
-    free = fit_with_free_scale(M, best.sight, best.fit, on_the_arm)
+    free = fit_with_free_scale(M, best.observed, best.fit, on_the_arm)
     scale_sigma = float(np.sqrt(free.covariance[12, 12]))
-    C, lever = best.sight.T_camera_board, lever_m(best.sight)
+    C, lever = best.observed.T_camera_board, best.observed.lever_m
     verdict = (
         find_partial_shift(M, C, best.X, best.Z, best.fit.used, views.names, lever)
         or (check_scale(free.scale, scale_sigma) if _turns_agree(free) else None)
@@ -153,14 +153,19 @@ def _check_result(best: Candidate) -> Verdict:
 
 def _estimate(views: Views, best: Candidate, scale: float, scale_sigma: float) -> Estimate:
     sigmas = np.sqrt(best.fit.variances).tolist()
-    if best.sight.stack is None or best.sight.intrinsics is None or best.sight.poses is None or views.camera is None:
+    if (
+        best.observed.stack is None
+        or best.observed.intrinsics is None
+        or best.observed.poses is None
+        or views.camera is None
+    ):
         Z, camera = best.Z, None
         noise = dict(zip(("across_view_m", "along_view_m", "tilt_rad", "roll_rad"), sigmas, strict=True))
     else:
-        Z = best.Z @ make_transform(np.eye(3), -best.sight.stack.center)
-        camera = _with_intrinsics(views.camera, best.sight.intrinsics) if best.refined else views.camera
+        Z = best.Z @ make_transform(np.eye(3), -best.observed.stack.center)
+        camera = _with_intrinsics(views.camera, best.observed.intrinsics) if best.refined else views.camera
         noise = dict(zip(("flange_position_m", "flange_rotation_rad", "corner_shared_px"), sigmas, strict=True))
-        noise["corner_px"] = best.sight.poses.sigma_px
+        noise["corner_px"] = best.observed.poses.sigma_px
     return Estimate(
         X=best.X,
         Z=Z,
@@ -182,7 +187,7 @@ def _with_intrinsics(camera: CameraModel, intrinsics: Array) -> CameraModel:
 
 def _depth(views: Views, best: Candidate) -> DepthFit | None:
     """From the board's plane as camera and arm together have it."""
-    stack = best.sight.stack
+    stack = best.observed.stack
     if views.corners is None or stack is None:
         return None
     T = predict(best.X, best.Z, moved_arm(views.T_parent_child, best.arm, views.mount == "fixed"))

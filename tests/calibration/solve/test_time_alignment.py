@@ -8,9 +8,11 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from calibration.solve.rigid import change, difference, exp, invert
-from calibration.solve.series import Series, align, read_series
-from calibration.solve.solver import solve_series
+from calibration.solve.pipeline import solve_series
+from calibration.solve.readers.pose_csv import read_series
+from calibration.solve.se3 import change, difference, exp, invert
+from calibration.solve.time_alignment import align
+from calibration.solve.time_series import Series
 from calibration.solve.verdict import Reason
 from robotcell.errors import CalibrationError, ConfigError
 from robotcell.geometry.transforms import look_at, make_transform

@@ -1,28 +1,29 @@
 """Collecting in the twin: kept when interrupted, gone on with, by hand, and never mixed with something else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from calibration.collect.capture import take_shot
-from calibration.collect.collection import (
+from calibration.collect.acquisition import collect, collect_by_hand
+from calibration.collect.capture import capture_view
+from calibration.collect.running_estimate import running_estimate
+from calibration.collect.session import (
     REFUSED,
     camera_model,
-    collect,
-    collect_by_hand,
+    load_records,
     open_session,
-    running_estimate,
+    read_session,
 )
-from calibration.collect.planning import HeldBoard
-from calibration.collect.session import load_records, read_session
-from calibration.solve.rigid import difference
-from calibration.target.board import DEFAULT_BOARD, held_by_gripper
+from calibration.solve.se3 import difference
 from calibration.target.detection import Detector
+from calibration.target.held_board import HeldBoard
 from robotcell.config import load_config
 from robotcell.errors import ConfigError, DeviceFault, GuardTripped
 from robotcell.interfaces import Intrinsics, RgbdFrame
-from robotcell.motion.executor import Executor
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import JointMove, MotionPlan
+from robotcell.perception.board_plate import DEFAULT_BOARD, held_by_gripper
 from sim_twin.devices.backend import open_twin
 from sim_twin.options import TwinOptions
 from sim_twin.world.held_board import T_flange_board
@@ -40,18 +41,18 @@ HELD = HeldBoard(DEFAULT_BOARD, held_by_gripper(DEFAULT_BOARD))
 OPTICS = Intrinsics(640, 480, 617.3, 617.3, 320.0, 240.0)
 
 
-class Follower:
+class Progress:
     """Writes down what it is told, and interrupts after some views."""
 
     def __init__(self, interrupt_after=None):
         self.taken, self.refused, self.estimates = [], [], []
         self._interrupt_after = interrupt_after
 
-    def going(self, taken, count):
+    def moving(self, taken, count):
         pass
 
-    def took(self, shot, taken, count, estimate):
-        self.refused.append(shot.detection.refused)
+    def captured(self, capture, taken, count, estimate):
+        self.refused.append(capture.detection.refused)
         self.taken.append(taken)
         self.estimates.append(estimate)
         if taken == self._interrupt_after:
@@ -69,49 +70,48 @@ def collected(tmp_path_factory):
     with open_twin(CONFIG)[0] as cell:
         open_session(folder, DEFAULT_BOARD, cell.camera.read(), resume=False)
         q_first = cell.arm.state().q
-        told["interrupted"] = Follower(interrupt_after=3)
+        told["interrupted"] = Progress(interrupt_after=3)
         with pytest.raises(KeyboardInterrupt):
             collect(cell, folder, HELD, 6, 1, told["interrupted"])
         told["kept"] = len(read_session(folder))
         open_session(folder, DEFAULT_BOARD, cell.camera.read(), resume=True)
-        told["resumed"], q_resumed = Follower(), cell.arm.state().q
+        told["resumed"], q_resumed = Progress(), cell.arm.state().q
         collect(cell, folder, HELD, 6, 1, told["resumed"])
         told["back"] = np.abs(cell.arm.state().q - q_resumed).max()
-        told["by hand"] = Follower()
+        told["by hand"] = Progress()
         answers = iter([True, False, True, False])
         collect_by_hand(cell, folder, DEFAULT_BOARD, 9, lambda: next(answers), told["by hand"])
         # At home the board hangs on edge before the camera: of no use, and not a view.
         home = MotionPlan("home", cell.arm.state().q, (JointMove("home", q_first, 1.0, 1.4),))
-        Executor(cell).run(check_path(home, CONFIG))
+        cell.executor.run(check_path(home, CONFIG))
         collect_by_hand(cell, folder, DEFAULT_BOARD, 9, lambda: next(answers), told["by hand"])
         cell.latch.trip("a hand in the cell")
-        told["latched"] = Follower()
+        told["latched"] = Progress()
         with pytest.raises(GuardTripped):
-            collect(cell, folder, HELD, 9, 1, told["latched"])
-        Executor(cell).recover()
+            collect(cell, folder, HELD, 8, 1, told["latched"])
+        cell.recover()
         cell.arm.start_joints(q_first + 0.3, 0.5, 1.0)
+        pushed = replace(cell, devices=replace(cell.devices, clock=PushedArmClock(cell)))
         with pytest.raises(DeviceFault, match="does not come to rest"):
-            _hold_still(cell)
+            capture_view(pushed, Detector(DEFAULT_BOARD))
     return folder, told
 
 
-def _hold_still(cell):
-    """A shot of an arm that somebody keeps pushing."""
-    sleep, arm = cell.clock.sleep, cell.arm
-    start = arm.state().q
+class PushedArmClock:
+    """A cell's clock, while somebody keeps pushing its arm."""
 
-    def push(dt):
-        sleep(dt)
-        arm.kick()
-        if not arm.moving:
-            way = -0.05 if (arm.state().q > start).all() else 0.05
-            arm.start_joints(arm.state().q + way, 0.5, 1.0)
+    def __init__(self, cell):
+        self._clock, self._arm, self._start = cell.clock, cell.arm, cell.arm.state().q
 
-    cell.clock.sleep = push
-    try:
-        take_shot(cell, Detector(DEFAULT_BOARD))
-    finally:
-        cell.clock.sleep = sleep
+    def now(self):
+        return self._clock.now()
+
+    def sleep(self, dt):
+        self._arm.kick()
+        self._clock.sleep(dt)
+        if not self._arm.moving:
+            way = -0.05 if (self._arm.state().q > self._start).all() else 0.05
+            self._arm.start_joints(self._arm.state().q + way, 0.5, 1.0)
 
 
 def test_an_interrupted_collection_keeps_its_views_and_is_gone_on_with(collected):

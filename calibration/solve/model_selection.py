@@ -1,4 +1,4 @@
-"""Results to choose from: what the camera saw, the fits to it, and their errors on views that took no part."""
+"""Model selection: the fits to choose from, and the one with the least error on views that took no part."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.solve.board_pose import BoardPoses, refine_poses, settle_ambiguity, start_poses, without_false_corners
-from calibration.solve.bundle import BundleNoise, solve_bundle
+from calibration.solve.board_pose import refine_poses
+from calibration.solve.bundle_adjustment import BundleNoise, solve_bundle
 from calibration.solve.closed_form import CLOSED_FORMS
-from calibration.solve.consensus import LEVER, find_consensus
-from calibration.solve.handeye import FLOOR, Fit, Noise, arm_noise, pose_noise, predict, refine, reject_outliers
-from calibration.solve.projection import CornerStack, intrinsics_vector, project, stack_corners
-from calibration.solve.rigid import change, difference
+from calibration.solve.consensus import find_consensus
+from calibration.solve.handeye import Fit, predict, refine, reject_outliers
+from calibration.solve.observations import BoardObservations, observations
+from calibration.solve.projection import CornerStack, intrinsics_vector, project
+from calibration.solve.se3 import change, difference
+from calibration.solve.variance_components import FLOOR, Noise, arm_noise, pose_noise
 
 if TYPE_CHECKING:
     from calibration.solve.views import Views
@@ -27,25 +29,12 @@ _CLEARLY = 0.01
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What the camera saw: poses of the board, and the corners behind them where there are any.
-
-    With corners the board's origin is the mean of its corners.
-    """
-
-    T_camera_board: Array
-    poses: BoardPoses | None = None
-    stack: CornerStack | None = None
-    intrinsics: Array | None = None
-
-
-@dataclass(frozen=True)
 class Candidate:
     """A result, and where the arm carries the board in views that take no part.
 
     Attributes:
         method: that gave it.
-        sight: that it rests on.
+        observed: that it rests on.
         fit: on poses, behind it.
         X: T_parent_camera.
         Z: T_child_board.
@@ -57,7 +46,7 @@ class Candidate:
     """
 
     method: str
-    sight: Sight
+    observed: BoardObservations
     fit: Fit
     X: Array
     Z: Array
@@ -69,7 +58,7 @@ class Candidate:
 
     def off(self) -> tuple[Array, Array]:
         """Held-out distance [m] and turn [rad] of each view (V,)."""
-        e = difference(self.sight.T_camera_board, self.T_camera_board)
+        e = difference(self.observed.T_camera_board, self.T_camera_board)
         return np.asarray(np.linalg.norm(e[:, :3], axis=1)), np.asarray(np.linalg.norm(e[:, 3:], axis=1))
 
     @property
@@ -78,39 +67,25 @@ class Candidate:
         if self.px is not None:
             return float(np.median(self.px))
         distance, turn = self.off()
-        return float(np.median(distance + lever_m(self.sight) * turn))
+        return float(np.median(distance + self.observed.lever_m * turn))
 
 
-def look(views: Views) -> Sight:
-    """The board's poses as the camera saw them."""
-    if views.corners is None or views.board is None or views.camera is None:
-        assert views.T_camera_board is not None
-        return Sight(views.T_camera_board)
-    stack = stack_corners(views.corners, views.board.corners())
-    intrinsics = intrinsics_vector(views.camera)
-    poses = refine_poses(stack, intrinsics, start_poses(stack, intrinsics))
-    expected = find_consensus(views.T_parent_child, poses.T_camera_board, free_scale=True)
-    T_expected = predict(expected.X, expected.Z, views.T_parent_child)
-    T_expected[:, :3, 3] /= expected.scale
-    poses = settle_ambiguity(stack, intrinsics, poses, T_expected)
-    stack = without_false_corners(stack, intrinsics, poses)
-    return _sight(stack, intrinsics, refine_poses(stack, intrinsics, poses.T_camera_board))
-
-
-def find_candidates(views: Views, M: Array, sight: Sight, on_the_arm: bool, refine_intrinsics: bool) -> list[Candidate]:
+def fit_candidates(
+    views: Views, M: Array, observed: BoardObservations, on_the_arm: bool, refine_intrinsics: bool
+) -> list[Candidate]:
     """Results to choose from, the one that is taken between equals first.
 
     One with refined intrinsics is always among them: it tells whether those that were given can be true.
     """
-    from_poses = _from_poses(M, sight, on_the_arm)
-    if views.camera is None or sight.stack is None:
+    from_poses = _from_poses(M, observed, on_the_arm)
+    if views.camera is None or observed.stack is None:
         return [from_poses]
     candidates = [_bundle(M, from_poses, views.camera, on_the_arm), from_poses]
     refined = _bundle(M, from_poses, views.camera, on_the_arm, refine_intrinsics=True)
     if refine_intrinsics:
         # Noise and outliers look different through the right lens.
         refined = _bundle(
-            M, _from_poses(M, refined.sight, on_the_arm), views.camera, on_the_arm, refine_intrinsics=True
+            M, _from_poses(M, refined.observed, on_the_arm), views.camera, on_the_arm, refine_intrinsics=True
         )
     return [*candidates, refined]
 
@@ -124,17 +99,12 @@ def best_of(candidates: list[Candidate]) -> Candidate:
     return best
 
 
-def fit_with_free_scale(M: Array, sight: Sight, fit: Fit, on_the_arm: bool) -> Fit:
+def fit_with_free_scale(M: Array, observed: BoardObservations, fit: Fit, on_the_arm: bool) -> Fit:
     """The same with the scale of the camera's distances free."""
-    C = sight.T_camera_board
+    C = observed.T_camera_board
     consensus = find_consensus(M, C, free_scale=True)
-    noise = _noise(M, sight, fit.X, on_the_arm)
+    noise = _noise(M, observed, fit.X, on_the_arm)
     return reject_outliers(consensus.X, consensus.Z, M, C, noise, scale=consensus.scale, free_scale=True)
-
-
-def lever_m(sight: Sight) -> float:
-    """The distance [m] at which a turn counts."""
-    return LEVER * float(np.median(np.linalg.norm(sight.T_camera_board[:, :3, 3], axis=1)))
 
 
 def moved_arm(M: Array, arm: Array, on_the_arm: bool) -> Array:
@@ -143,33 +113,35 @@ def moved_arm(M: Array, arm: Array, on_the_arm: bool) -> Array:
     return np.asarray(M @ changes if on_the_arm else changes @ M)
 
 
-def _from_poses(M: Array, sight: Sight, on_the_arm: bool) -> Candidate:
+def _from_poses(M: Array, observed: BoardObservations, on_the_arm: bool) -> Candidate:
     """Refinement in SE(3) from every closed form, outliers left out."""
-    C = sight.T_camera_board
+    C = observed.T_camera_board
     consensus = find_consensus(M, C)
     X, Z = consensus.X, consensus.Z
     for _ in range(_PASSES):
-        noise = _noise(M, sight, X, on_the_arm)
+        noise = _noise(M, observed, X, on_the_arm)
         fit = reject_outliers(X, Z, M, C, noise)
         X, Z = fit.X, fit.Z
-    candidates = [_pose_candidate("consensus", M, sight, fit)]
+    candidates = [_pose_candidate("consensus", M, observed, fit)]
     for name, closed_form in CLOSED_FORMS.items():
         try:
             X, Z = closed_form(M[fit.used], C[fit.used])
         except ValueError:
             continue
-        candidates.append(_pose_candidate(name, M, sight, refine(X, Z, M, C, noise, fit.used, variances=fit.variances)))
+        candidates.append(
+            _pose_candidate(name, M, observed, refine(X, Z, M, C, noise, fit.used, variances=fit.variances))
+        )
     return best_of(candidates)
 
 
-def _pose_candidate(start: str, M: Array, sight: Sight, fit: Fit) -> Candidate:
+def _pose_candidate(start: str, M: Array, observed: BoardObservations, fit: Fit) -> Candidate:
     carried = predict(fit.X_held_out, fit.Z_held_out, M)
     px = None
-    if sight.stack is not None and sight.intrinsics is not None:
-        px = _held_out_px(sight.stack, carried, sight.intrinsics)
+    if observed.stack is not None and observed.intrinsics is not None:
+        px = _held_out_px(observed.stack, carried, observed.intrinsics)
     return Candidate(
         f"{start}, refined in SE(3)",
-        sight,
+        observed,
         fit,
         fit.X,
         fit.Z,
@@ -184,7 +156,7 @@ def _bundle(
     M: Array, start: Candidate, camera: CameraModel, on_the_arm: bool, *, refine_intrinsics: bool = False
 ) -> Candidate:
     """Bundle over the corners of the used views."""
-    stack, fit = start.sight.stack, start.fit
+    stack, fit = start.observed.stack, start.fit
     assert stack is not None
     used = np.flatnonzero(fit.used)
     position_m, rotation_rad, corner_px = np.sqrt(fit.variances)
@@ -207,13 +179,13 @@ def _bundle(
         bundle.arm,
     )
     carried = predict(X, Z, M)
-    sight = start.sight
+    observed = start.observed
     if refine_intrinsics:
-        poses = refine_poses(stack, bundle.intrinsics, sight.T_camera_board)
-        sight = _sight(stack, bundle.intrinsics, poses)
+        poses = refine_poses(stack, bundle.intrinsics, observed.T_camera_board)
+        observed = observations(stack, bundle.intrinsics, poses)
     return Candidate(
         start.method.replace("refined in SE(3)", "bundle over corners"),
-        sight,
+        observed,
         fit,
         bundle.X,
         bundle.Z,
@@ -225,17 +197,15 @@ def _bundle(
     )
 
 
-def _sight(stack: CornerStack, intrinsics: Array, poses: BoardPoses) -> Sight:
-    return Sight(poses.T_camera_board, poses, stack, intrinsics)
-
-
-def _noise(M: Array, sight: Sight, X: Array, on_the_arm: bool) -> Noise:
-    C = sight.T_camera_board
-    if sight.poses is None:
+def _noise(M: Array, observed: BoardObservations, X: Array, on_the_arm: bool) -> Noise:
+    C = observed.T_camera_board
+    if observed.poses is None:
         return pose_noise(C)
     # The arm's errors, and those of the corners; what the corners of a view have in common raises the latter.
-    shapes = np.concatenate([arm_noise(X, M, C, on_the_arm=on_the_arm), np.linalg.inv(sight.poses.information)[None]])
-    return Noise(shapes, np.array([FLOOR**2, FLOOR**2, sight.poses.sigma_px**2]))
+    shapes = np.concatenate(
+        [arm_noise(X, M, C, on_the_arm=on_the_arm), np.linalg.inv(observed.poses.information)[None]]
+    )
+    return Noise(shapes, np.array([FLOOR**2, FLOOR**2, observed.poses.sigma_px**2]))
 
 
 def _held_out_px(stack: CornerStack, T_camera_board: Array, intrinsics: Array) -> Array:

@@ -1,9 +1,10 @@
-"""Bundle over corner pixels: camera, board, what the arm's poses are off by, and on request the intrinsics.
+"""Bundle adjustment over corner pixels: camera, board, what the arm's poses are off by, and on request the intrinsics.
 
 A corner of view i is predicted at project(inv(X) M_i(a_i) Z p). The arm's pose is off by a small change a_i of the
 flange, which is held near zero by the arm's noise; its standard deviations, and that of a corner, are estimated from
-the data before (calibration.solve.handeye). The a_i are eliminated from the normal equations (Schur complement), so a
-step costs little more than reading the corners, and leaving one view out is a step with that view's share taken out.
+the data before (calibration.solve.variance_components). The a_i are eliminated from the normal equations (Schur
+complement), so a step costs little more than reading the corners, and leaving one view out is a step with that view's
+share taken out.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.solve.handeye import HUBER
-from calibration.solve.projection import INTRINSICS, CornerStack, corner_weights, project
-from calibration.solve.rigid import change, exp, skew
+from calibration.solve.projection import INTRINSICS, CornerStack, project
+from calibration.solve.robust_weights import corner_weights, huber_weights
+from calibration.solve.se3 import change, exp, skew
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -184,7 +185,7 @@ def _arm_weights(problem: _Problem, state: _State) -> tuple[Array, Array, Array]
     noise = problem.noise
     inverse = np.repeat([1 / noise.position_m**2, 1 / noise.rotation_rad**2], 3)
     distance = np.sqrt((state.arm**2 * inverse).sum(axis=1))
-    return inverse, np.minimum(1.0, HUBER / np.maximum(distance, 1e-12)), distance
+    return inverse, huber_weights(distance), distance
 
 
 def _cost(problem: _Problem, state: _State) -> float:

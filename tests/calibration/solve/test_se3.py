@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from calibration.solve.rigid import change, difference, exp, invert, log, nearest_rotation, skew
+from calibration.solve.se3 import change, difference, exp, invert, log, nearest_rotation, skew
 from robotcell.geometry.transforms import check_transform, make_transform
 
 number = st.floats(-2, 2)

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.solve.bundle import BundleNoise, solve_bundle
+from calibration.solve.bundle_adjustment import BundleNoise, solve_bundle
 from calibration.solve.projection import intrinsics_vector, stack_corners
-from calibration.solve.rigid import change, difference
+from calibration.solve.se3 import change, difference
 from robotcell.geometry.transforms import make_transform
 from tests.calibration.synthetic import BOARD, CAMERA, make_views
 

@@ -9,28 +9,24 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.solve.rigid import invert, log
-from calibration.target.board import plate_corners, size_m
+from calibration.collect.board_motion import FLANGE, plan_motion
+from calibration.solve.se3 import invert, log
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform, transform_points
-from robotcell.motion.path_check import check_path
-from robotcell.motion.plan import JointMove, MotionPlan
-from robotcell.motion.tool import TALLEST_OBJECT_M
+from robotcell.perception.board_plate import size_m
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from calibration.target.held_board import HeldBoard
     from robotcell.config import CellConfig
-    from robotcell.config.calibration_file import CharucoBoard
     from robotcell.interfaces import Intrinsics
-    from robotcell.motion.path_check import CheckedPlan
 
 # Beyond this, corners of a printed board get uncertain and its depth is lost to reflections.
 MAX_TILT_RAD = np.radians(45)
@@ -40,49 +36,14 @@ _NEAREST_M = 0.46
 _MIN_SQUARE_PX = 20
 # The board stays this share of the image away from its border: the guess of the camera's pose may be some degrees off.
 _MARGIN = 0.06
-# Room around the plate for how differently it may be held.
-_CLEARANCE_M = 0.015
-# Whatever stands on the table stays there; board, gripper and wrists pass over it.
-_ABOVE_TABLE_M = TALLEST_OBJECT_M + _CLEARANCE_M
-_POINT_SPACING_M = 0.02
-# A plate that sways: slower than a job.
-_JOINT_SPEED_RAD_S = 0.6
-_PATH_STEP_RAD = 0.04
 # So many candidates for each view that is asked for, and so many draws for each candidate.
 _CANDIDATES = 5
 _DRAWS = 40
 # Two views differ by one when the board is so far away from itself, or so turned.
 _FAR_M = 0.15
 _TURNED_RAD = 0.5
-_HUB_DRAWS = 600
-_HUBS = 10
-
-
-@dataclass(frozen=True)
-class HeldBoard:
-    """A board on the flange, as well as it is known.
-
-    Attributes:
-        board: its layout.
-        T_flange_board: (4, 4).
-    """
-
-    board: CharucoBoard
-    T_flange_board: Array
-
-    @cached_property
-    def center(self) -> Array:
-        """(3,) middle of the squares in the board frame [m]."""
-        return np.array([*size_m(self.board), 0.0]) / 2
-
-    @cached_property
-    def points(self) -> Array:
-        """(N, 3) points all over the plate, in the frame of the flange [m]."""
-        corners = plate_corners(self.board)
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        x, y = (np.linspace(low[i], high[i], int((high[i] - low[i]) / _POINT_SPACING_M) + 2) for i in (0, 1))
-        grid = np.stack([*np.meshgrid(x, y), np.zeros((len(y), len(x)))], axis=-1).reshape(-1, 3)
-        return np.asarray(transform_points(self.T_flange_board, grid))
+_VIA_DRAWS = 600
+_VIA_POSES = 10
 
 
 @dataclass(frozen=True)
@@ -90,11 +51,11 @@ class ViewPlan:
     """Where to take views.
 
     Attributes:
-        hub: joint angles (6,) of a pose through which every view can be gone to.
+        q_via: joint angles (6,) of a pose through which every view can be gone to.
         views: joint angles (6,) of the views, in the order to go to them.
     """
 
-    hub: Array
+    q_via: Array
     views: tuple[Array, ...]
 
 
@@ -125,47 +86,16 @@ def plan_views(
     """
     rng = np.random.default_rng([seed, len(taken)])
     refused: Counter[str] = Counter()
-    hub = _find_hub(config, held, T_base_camera, intrinsics, rng, q_start, refused)
-    if hub is None:
+    q_via = _find_via_pose(config, held, T_base_camera, intrinsics, rng, q_start, refused)
+    if q_via is None:
         reasons = ", ".join(f"{reason} ({times} times)" for reason, times in refused.most_common(3))
         raise UnsafeMotion(
             f"no pose of the arm shows the board to the camera: {reasons}. Check the camera's place in cell.toml, the "
             "workspace and the keep-outs, how the board is held, and that the arm can leave the pose that it is in"
         )
-    poses, joints = _candidates(config, held, T_base_camera, intrinsics, count * _CANDIDATES, rng, hub)
+    poses, joints = _candidates(config, held, T_base_camera, intrinsics, count * _CANDIDATES, rng, q_via)
     chosen = _most_different(poses, list(taken), count)
-    return ViewPlan(hub, tuple(_in_order([joints[i] for i in chosen], q_start)))
-
-
-def plan_ways(
-    label: str, q_start: Array, q: Array, hub: Array, held: HeldBoard, config: CellConfig
-) -> list[CheckedPlan]:
-    """The motions to joint angles (6,): straight there, or else through the hub.
-
-    Raises:
-        UnsafeMotion: neither is safe.
-    """
-    try:
-        return [plan_way(label, q_start, q, held, config)]
-    except UnsafeMotion:
-        to_hub = plan_way(f"{label}, by way of the middle", q_start, hub, held, config)
-        return [to_hub, plan_way(label, hub, q, held, config)]
-
-
-def plan_way(label: str, q_start: Array, q: Array, held: HeldBoard, config: CellConfig) -> CheckedPlan:
-    """A joint-space motion with the board in the gripper, checked for arm, gripper and board.
-
-    Raises:
-        UnsafeMotion: the first thing that stands in the way.
-    """
-    speed = min(_JOINT_SPEED_RAD_S, config.motion.joint_speed_rad_s)
-    move = JointMove(label, q, speed, config.motion.joint_acceleration_rad_s2)
-    checked = check_path(MotionPlan(label, q_start, (move,)), config)
-    steps = max(2, int(np.ceil(np.abs(q - q_start).max() / _PATH_STEP_RAD)) + 1)
-    path = q_start + np.linspace(0.0, 1.0, steps)[:, None] * (q - q_start)
-    # Where the arm stands now is a fact: only where it goes is checked.
-    _check_board(path[1:], held, config, label)
-    return checked
+    return ViewPlan(q_via, tuple(_in_order([joints[i] for i in chosen], q_start)))
 
 
 def visible(T_camera_board: Array, held: HeldBoard, intrinsics: Intrinsics) -> bool:
@@ -185,7 +115,7 @@ def visible(T_camera_board: Array, held: HeldBoard, intrinsics: Intrinsics) -> b
     return bool(inside.all() and facing > np.cos(MAX_TILT_RAD))
 
 
-def _find_hub(
+def _find_via_pose(
     config: CellConfig,
     held: HeldBoard,
     T_base_camera: Array,
@@ -196,22 +126,22 @@ def _find_hub(
 ) -> Array | None:
     """Joint angles of a pose in the middle of the view that the arm can go to, the nearest of several; or None."""
     found: list[Array] = []
-    for _ in range(_HUB_DRAWS):
+    for _ in range(_VIA_DRAWS):
         T_camera_board = _draw(held, intrinsics, rng, middle=True)
         q = ur5e.inverse(T_base_camera @ T_camera_board @ invert_transform(held.T_flange_board), q_start)
         if q is None:
             refused["out of reach"] += 1
             continue
-        if _hidden(q, held, T_base_camera[:3, 3]):
+        if _occluded(q, held, T_base_camera[:3, 3]):
             refused["the arm hides the board"] += 1
             continue
         try:
-            plan_way("first view", q_start, q, held, config)
+            plan_motion("first view", q_start, q, held, config)
         except UnsafeMotion as error:
             refused[str(error).partition(": ")[2]] += 1
             continue
         found.append(q)
-        if len(found) == _HUBS:
+        if len(found) == _VIA_POSES:
             break
     return min(found, key=lambda q: float(np.abs(q - q_start).max()), default=None)
 
@@ -223,25 +153,25 @@ def _candidates(
     intrinsics: Intrinsics,
     count: int,
     rng: np.random.Generator,
-    hub: Array,
+    q_via: Array,
 ) -> tuple[list[Array], list[Array]]:
-    """T_camera_board and joint angles of poses that are visible and that the arm can go to from the hub."""
+    """T_camera_board and joint angles of poses that are visible and that the arm can go to from the via pose."""
     T_board_flange = invert_transform(held.T_flange_board)
-    joints = [hub]
-    poses = [np.asarray(invert_transform(T_base_camera) @ ur5e.forward(hub) @ held.T_flange_board)]
+    joints = [q_via]
+    poses = [np.asarray(invert_transform(T_base_camera) @ ur5e.forward(q_via) @ held.T_flange_board)]
     for _ in range(count * _DRAWS):
         if len(poses) == count:
             break
         T_camera_board = _draw(held, intrinsics, rng)
         if not visible(T_camera_board, held, intrinsics):
             continue
-        q = ur5e.inverse(T_base_camera @ T_camera_board @ T_board_flange, hub)
-        if q is None or _hidden(q, held, T_base_camera[:3, 3]):
+        q = ur5e.inverse(T_base_camera @ T_camera_board @ T_board_flange, q_via)
+        if q is None or _occluded(q, held, T_base_camera[:3, 3]):
             continue
         try:
             # Where the arm cannot stand it cannot go either, and that is sooner found out.
-            plan_way("stand", q, q, held, config)
-            plan_way("way", hub, q, held, config)
+            plan_motion("stand", q, q, held, config)
+            plan_motion("way", q_via, q, held, config)
         except UnsafeMotion:
             continue
         poses.append(T_camera_board)
@@ -296,36 +226,12 @@ def _in_order(joints: list[Array], q_start: Array) -> list[Array]:
     return order
 
 
-def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str) -> None:
-    """Keep the plate clear of table, obstacles and arm along joint angles (N, 6)."""
-    T_base_flange = ur5e.forward(path)
-    points = np.einsum("nij,kj->nki", T_base_flange[:, :3, :3], held.points) + T_base_flange[:, None, :3, 3]
-    centers = bodies.sphere_centers(path)
-    wrists = bodies.SPHERES.link >= _WRISTS
-    lowest = min(points[..., 2].min(), (centers[:, wrists, 2] - bodies.SPHERES.radius[wrists]).min())
-    if lowest < config.table.height_m + _ABOVE_TABLE_M:
-        raise UnsafeMotion(f"{label}: the board or the wrist would touch what may stand on the table")
-    for box in bodies.obstacles(config):
-        if bodies.box_distance(box, points).min() < _CLEARANCE_M:
-            raise UnsafeMotion(f"{label}: the board would enter the keep-out {box.name!r}")
-    moves_apart = bodies.SPHERES.link < _FLANGE
-    gaps = (
-        np.linalg.norm(points[:, :, None] - centers[:, None, moves_apart], axis=-1) - bodies.SPHERES.radius[moves_apart]
-    )
-    if gaps.min() < _CLEARANCE_M:
-        raise UnsafeMotion(f"{label}: the board would touch the arm")
-
-
-def _hidden(q: Array, held: HeldBoard, eye: Array) -> bool:
+def _occluded(q: Array, held: HeldBoard, eye: Array) -> bool:
     """Whether the arm stands between the camera at `eye` (3,) and the board."""
     points = transform_points(ur5e.forward(q), held.points)
-    moves_apart = bodies.SPHERES.link < _FLANGE
+    moves_apart = bodies.SPHERES.link < FLANGE
     to_center = bodies.sphere_centers(q)[moves_apart] - eye
     sight = points - eye
     along = np.clip((to_center @ sight.T) / (sight**2).sum(axis=1), 0.0, 1.0)
     gaps = np.linalg.norm(to_center[:, None] - along[..., None] * sight, axis=-1)
     return bool((gaps < bodies.SPHERES.radius[moves_apart, None]).any())
-
-
-# Indices of the first wrist and of the flange among the frames of `bodies.Spheres`.
-_WRISTS, _FLANGE = 4, 6
