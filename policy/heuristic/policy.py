@@ -11,8 +11,9 @@ from policy.antipodal import antipodal_grasps
 from policy.barred import repeats_grasp
 from policy.finger_clearance import OpenGripper, pad_maps
 from policy.map_grid import cell_centers, check_resolution, workspace_at
+from policy.push.border import USEFUL_GAIN
 from policy.push.outcome import PushForwardModel
-from policy.push.value import USEFUL_GAIN, PushValue, evaluate_pushes
+from policy.push.value import PushValue, evaluate_pushes
 from policy.shadows import complete_heights
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import PickAny, Uncover

@@ -16,8 +16,9 @@ from policy.learned.selection import best_cells, check_maps, smoothed, surface_a
 from policy.map_grid import cell_centers, check_resolution, workspace_at
 from policy.network.encoding import RESOLUTION_M, encode
 from policy.network.q_network import GRASP, PUSH
+from policy.push.border import USEFUL_GAIN
 from policy.push.outcome import PushForwardModel
-from policy.push.value import USEFUL_GAIN, PushValue, evaluate_pushes
+from policy.push.value import PushValue, evaluate_pushes
 from policy.shadows import complete_heights
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import Uncover

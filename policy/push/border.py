@@ -6,8 +6,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Paper: the border is 10 dilations by cells of 2 mm wide; a cell of it from 2 cm to 30 cm high is occupied.
+# Paper: the border is 10 dilations by cells of 2 mm wide.
 _BORDER_M = 0.020
+# Paper, stage II: a push that frees more than tau of its object's border earns the reward, and is worth making.
+USEFUL_GAIN = 0.1
+# Paper: a cell of the border that is so high is occupied.
 _OCCUPIED_M = (0.02, 0.30)
 
 

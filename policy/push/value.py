@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     # Q maps (K, H, W) of pushes at cells (K, H, W).
     PushMaps = Callable[[npt.NDArray[np.bool_]], npt.NDArray[np.float32]]
 
-# A push that frees more than this of an object's border is useful (paper, stage II: tau of the reward).
-USEFUL_GAIN = 0.1
 # What a push loses that may take an object out of the workspace, and one that may so lose what it is for.
 _LOSS, _WANTED_LOSS = 0.3, 1.0
 # Where no push near the targets has a place to start, the mask grows by the same again, up to so many times in all.

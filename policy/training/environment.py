@@ -21,7 +21,7 @@ from policy.learned.selection import surface_at
 from policy.map_grid import workspace_at
 from policy.network.encoding import CHANNELS, RESOLUTION_M, encode
 from policy.network.q_network import GRASP, PUSH
-from policy.push.border import border_occupancy
+from policy.push.border import USEFUL_GAIN, border_occupancy
 from policy.push.line import PushLine, free_to_descend, push_line
 from policy.training.scenes import training_scene
 from robotcell.config import CameraMount, CellConfig
@@ -30,7 +30,7 @@ from robotcell.geometry.transforms import look_at, make_transform
 from robotcell.motion.executor import Ending
 from robotcell.motion.grasp import grasp_height
 from robotcell.motion.push import push_height
-from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.rotations import GRASP_ROTATIONS, ROTATIONS, rotation_angle_rad
 from robotcell.motion.tool import near_height
 from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.heightmap import Heightmap, build_heightmap
@@ -45,8 +45,7 @@ if TYPE_CHECKING:
 
     from robotcell.geometry.transforms import Array
 
-# Paper, stage II: a push that gains more than tau of the border earns the reward.
-GAIN_TAU = 0.1
+# Paper, stage II: the reward of a push that frees more than tau of the border (`policy.push.border.USEFUL_GAIN`).
 PUSH_REWARD = 0.5
 # Stage I: a push scatters when the objects' borders are freed by this much on average over all that moved.
 _SCATTER = 0.02
@@ -282,13 +281,13 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         )
 
     def _run(self, primitive: int, rotation: int, cell: Cell) -> Trial:
-        return self._grasp(rotation % (ROTATIONS // 2), cell) if primitive == GRASP else self._push(rotation, cell)
+        return self._grasp(rotation % GRASP_ROTATIONS, cell) if primitive == GRASP else self._push(rotation, cell)
 
     def _grasp(self, rotation: int, cell: Cell) -> Trial:
         gripper, state, config = self._need(), self.state, self._config
         table = config.table.height_m
         x, y = config.workspace.position(*cell)
-        theta = 2 * np.pi * rotation / ROTATIONS
+        theta = rotation_angle_rad(rotation)
         tcp_z = table + grasp_height(surface_at(state.height_m, cell, RESOLUTION_M), config)
         near_z = near_height(state.heightmap, x, y, theta, config.gripper.preshape_m, tcp_z, config)
         attempt = gripper.grasp(x, y, theta, near_z, tcp_z)
@@ -309,7 +308,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         if line is None:
             return Trial(Outcome.NO_START, (), nothing)
         x, y = workspace.position(line.row, line.col)
-        theta = 2 * np.pi * rotation / ROTATIONS
+        theta = rotation_angle_rad(rotation)
         tcp_z = table + push_height(line.top_m, config)
         near_z = near_height(state.heightmap, x, y, theta, 0.0, tcp_z, config)
         length = (len(line.cells) - 1) * RESOLUTION_M
@@ -342,7 +341,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         for target in dict.fromkeys(int(v) for v in on_way[:reach] if v):
             own = np.flatnonzero(on_way[:reach] == target)
             at = line.cells[own[len(own) // 2]]
-            reward = PUSH_REWARD if gains.get(target, 0.0) > GAIN_TAU else 0.0
+            reward = PUSH_REWARD if gains.get(target, 0.0) > USEFUL_GAIN else 0.0
             # The middle of what the push meets, and for the chosen object the cell it was chosen for.
             places = {(int(at[0]), int(at[1]))} | ({cell} if target == int(state.labels[cell]) else set())
             rows += [(place, target, (scatter, reward), target in gains) for place in sorted(places)]

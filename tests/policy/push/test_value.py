@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from policy.push.border import USEFUL_GAIN
 from policy.push.outcome import PushForwardModel
-from policy.push.value import USEFUL_GAIN, evaluate_pushes
+from policy.push.value import evaluate_pushes
 from robotcell.config import CellConfig
 from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
 from robotcell.motion.push import push_in_workspace
