@@ -16,9 +16,8 @@ import torch
 from policy import make_policy
 from policy.finger_clearance import OpenGripper
 from policy.learned.graspability import Graspability
-from policy.network.encoding import encode
+from policy.network.encoding import GRASP, PUSH, encode
 from policy.network.inference import Inference
-from policy.network.q_network import GRASP, PUSH
 from policy.network.registry import make_network
 from policy.network.weights import load_named
 from policy.push.candidates import cells_with_start, pushable_cells

@@ -51,9 +51,8 @@ class Serving:
 def serving():
     serving = Serving("127.0.0.29")
     yield serving
-    # The last test of those that share it has ended it, unless it did not run.
-    if serving.process.poll() is None:
-        serving.end(signal.SIGTERM)
+    assert serving.end(signal.SIGTERM) == (0, "")
+    assert all_end(serving.servers)
 
 
 def run(*words):
@@ -104,7 +103,8 @@ def test_no_control_socket(control, code):
     assert run("fault", "--control", control, "--list")[0] == code
 
 
-def test_an_interrupt_ends_it_clean(serving):
+def test_an_interrupt_ends_it_clean():
+    serving = Serving("127.0.0.22")
     assert serving.end(signal.SIGINT) == (0, "")
     assert all_end(serving.servers)
 
