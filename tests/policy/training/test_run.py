@@ -1,9 +1,9 @@
 from __future__ import annotations
 
+import multiprocessing
 import shutil
 import signal
-import subprocess
-import sys
+import time
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import torch
 
 from policy.network.weights import load_weights
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
-from policy.training.config import LearningSettings, StageSettings, TrainConfig
+from policy.training.config import LearningSettings, StageSettings, TrainConfig, load_train_config
 from policy.training.run import prepare, train
 from policy.training.run_folder import read_metrics
 from policy.training.shard import Shard
@@ -23,6 +23,7 @@ from tests.policy.training import toy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from multiprocessing.connection import Connection
 
 STAGE = StageSettings(
     rounds=3,
@@ -41,22 +42,19 @@ CONFIG = TrainConfig(
     stage2=STAGE.model_copy(update={"rounds": 1, "warmup_rounds": 0}),
 )
 
-# A process that trains slowly, and says what it does.
-SLOW = """
-import sys, time
-from pathlib import Path
-import torch
-from policy.training.config import load_train_config
-from policy.training.run import train
-from tests.policy.training import toy
+# Those that are killed: a fork has imported everything already.
+FORK = multiprocessing.get_context("fork")
 
-torch.set_num_threads(1)
-def say(what, done, total):
-    print(what, done, total, flush=True)
-    time.sleep(0.01 if what == "look ahead" else 0.1)
-run = Path(sys.argv[1])
-train(load_train_config(run / "stage1" / "train.toml"), 1, run, workers=1, collect=toy.collect, on_progress=say)
-"""
+
+def train_slowly(run: Path, told: Connection) -> None:
+    """Stage 1, saying what it does."""
+
+    def say(what: str, done: int, total: int) -> None:
+        told.send((what, done, total))
+        time.sleep(0.01 if what == "look ahead" else 0.1)
+
+    config = load_train_config(run / "stage1" / "train.toml")
+    train(config, 1, run, workers=1, collect=toy.collect, on_progress=say)
 
 
 def run_stage(run: Path, stage: int = 1, config: TrainConfig | None = CONFIG, **settings: Any) -> TrainConfig:
@@ -143,30 +141,28 @@ def test_what_follows_a_push_is_found_in_every_round(trained: Path) -> None:
     assert not all(torch.equal(tensor, state["target"][name]) for name, tensor in state["online"].items())
 
 
-def kill_when(run: Path, said: Callable[[str], bool]) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", SLOW, str(run)], stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3]
-    )
-    with process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if said(line):
-                process.send_signal(signal.SIGKILL)
-                break
-    assert process.returncode == -signal.SIGKILL
+def kill_when(run: Path, said: Callable[[tuple[str, int, int]], bool]) -> None:
+    ours, theirs = FORK.Pipe(duplex=False)
+    process = FORK.Process(target=train_slowly, args=(run, theirs))
+    process.start()
+    theirs.close()
+    with ours:
+        while not said(ours.recv()):
+            pass
+        process.kill()
+        process.join()
+    assert process.exitcode == -signal.SIGKILL
 
 
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(trained: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     prepare(1, run, CONFIG)
-    kill_when(run, lambda line: line.startswith("collect 2 3"))
+    kill_when(run, lambda told: told == ("collect", 2, 3))
     first = {path.name: path.stat().st_mtime_ns for path in (run / "stage1" / "shards").iterdir()}
     assert {"r0000-t000.npz", "r0000-t001.npz"} <= first.keys()
     assert not (run / "stage1" / "checkpoint.pt").exists()
     # The next process finishes round 0, and is killed while it learns in round 1.
-    kill_when(
-        run, lambda line: line.startswith("learn 3 5") and (run / "stage1" / "shards" / "r0001-t002.npz").exists()
-    )
+    kill_when(run, lambda told: told == ("learn", 3, 5) and (run / "stage1" / "shards" / "r0001-t002.npz").exists())
     assert load_checkpoint(run / "stage1" / "checkpoint.pt")["rounds"] == 1
     # As many workers as there are tasks, which may end in any order.
     train(prepare(1, run, resume=True), 1, run, workers=3, collect=toy.collect)
