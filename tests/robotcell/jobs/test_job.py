@@ -113,6 +113,31 @@ def test_a_goal_is_picked_and_confirmed(config: CellConfig) -> None:
     assert sorted(path.name for path in (report.run_dir / "frames").iterdir())
 
 
+def test_what_was_decided_and_felt_is_in_the_journal(config: CellConfig) -> None:
+    policy = Scripted([push_at(-0.58, -0.06), grasp_at(*RED)])
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        report = run_job(cell, policy, journal, ("red",))
+        push, grasp = journal.job(report.job_id).actions
+    assert (push.primitive, push.x, push.y, push.surface_m) == ("push", -0.58, -0.06, 0.05)
+    assert (push.end_x, push.end_y) == pytest.approx((-0.48, -0.06))
+    assert (grasp.primitive, grasp.surface_m, grasp.end_x) == ("grasp", 0.05, None)
+    for row in (push, grasp):
+        assert row.outcome is not None
+        # The fingers moved in both, and what they pressed with is known, though nothing ended the plan.
+        assert row.outcome.grip_force_n is not None
+        assert row.outcome.peak_force_n is not None
+    assert grasp.outcome is not None
+    assert 0 < (grasp.outcome.grip_force_n or 0) < config.motion.closing_force_n
+
+
+def test_a_policy_sees_the_map_that_it_declares_and_people_the_one_of_the_file(config: CellConfig) -> None:
+    coarse = config.model_copy(update={"workspace": config.workspace.model_copy(update={"resolution_m": 0.004})})
+    policy = Scripted([grasp_at(*RED)], workspace=Workspace(resolution_m=0.003))
+    report, results, _ = run(coarse, policy, ("red",))
+    assert results == [Result.PICKED], report.reason
+    assert policy.seen[0].heightmap.workspace.resolution_m == 0.003
+
+
 def test_a_wrong_object_counts_as_wrong(config: CellConfig) -> None:
     report, results, _ = run(config, Scripted([grasp_at(*BLUE)]), ("red",))
     assert results == [Result.WRONG_OBJECT]
