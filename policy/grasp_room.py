@@ -13,13 +13,10 @@ import numpy.typing as npt
 
 from robotcell.geometry import rg2
 from robotcell.motion.grasp import GRASP_DEPTH_M
-from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.rotations import GRASP_ROTATIONS, ROTATIONS
 
 if TYPE_CHECKING:
     from policy.shadows import Surface
-
-# The jaw is symmetric: half a turn changes nothing.
-DIRECTIONS = ROTATIONS // 2
 
 # What stands this far above the tcp is taken for material that the closed fingers press on: the tips of fingers that
 # hold a 50 mm block are 5 mm above it, and 3 mm of noise must not count as a wall.
@@ -116,7 +113,7 @@ def find_grasps(table: Table, cells: npt.NDArray[np.bool_], jaw: Jaw) -> Grasps:
     lattice[::step, ::step] = True
     rows, cols = np.nonzero(cells & lattice)
     found = _join(
-        [_score(table, rows, cols, np.full(len(rows), k, np.intp), jaw) for k in range(DIRECTIONS)],
+        [_score(table, rows, cols, np.full(len(rows), k, np.intp), jaw) for k in range(GRASP_ROTATIONS)],
     )
     if step == 1:
         return found
@@ -130,7 +127,8 @@ def find_grasps(table: Table, cells: npt.NDArray[np.bool_], jaw: Jaw) -> Grasps:
     on = cells[rows, cols]
     rows, cols, rotation = rows[on], cols[on], rotation[on]
     refined = [
-        _score(table, rows[rotation == k], cols[rotation == k], rotation[rotation == k], jaw) for k in range(DIRECTIONS)
+        _score(table, rows[rotation == k], cols[rotation == k], rotation[rotation == k], jaw)
+        for k in range(GRASP_ROTATIONS)
     ]
     return _join([found, *refined])
 
@@ -305,7 +303,7 @@ def _finger_offsets(stride: int, resolution_m: float, opening_m: float, margin_m
     along = _spaced(rg2.FINGER_THICKNESS_M / 2 + margin_m, resolution_m) + opening_m / 2 + rg2.FINGER_THICKNESS_M / 2
     across = _spaced(rg2.FINGER_BREADTH_M / 2 + margin_m, resolution_m)
     both = np.concatenate([along, -along])
-    return np.stack([_flat(k, both, across, stride, resolution_m) for k in range(DIRECTIONS)])
+    return np.stack([_flat(k, both, across, stride, resolution_m) for k in range(GRASP_ROTATIONS)])
 
 
 @lru_cache(maxsize=64)

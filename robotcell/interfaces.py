@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
+# A motion that is not kicked for so long [s] stops, on every backend. Chosen: 25 periods of the executor, so that a
+# pause of the interpreter costs no motion, and 5 cm of a straight motion at 0.25 m/s.
+KICK_TIMEOUT_S = 0.2
+
 
 class ArmMode(enum.Enum):
     """What the controller lets the arm do."""
@@ -142,7 +146,9 @@ class Device(Protocol):
 
 
 class Arm(Device, Protocol):
-    """A six-joint arm. Motions return at once; the caller supervises them with `moving`, `state` and `stop`.
+    """A six-joint arm. Motions return at once; the caller supervises them with `moving`, `state`, `kick` and `stop`.
+
+    A motion that is not kicked for `KICK_TIMEOUT_S` stops, whether or not it was ever kicked.
 
     Every method raises ConnectionLost when the arm is not connected (or no longer is), and those that move it
     raise DeviceFault when its mode is not READY and UnsafeMotion when the device would refuse the argument. A new
@@ -163,7 +169,11 @@ class Arm(Device, Protocol):
         ...
 
     def start_linear(self, T_base_tcp: Array, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Start a straight motion of the tcp to `T_base_tcp`, rotation interpolated."""
+        """Start a straight motion of the tcp to `T_base_tcp`, rotation interpolated.
+
+        Only the ranges of the arguments are checked here: a line that the arm cannot follow ends in a stop that must be
+        recovered. `robotcell.motion.path_check` finds such lines before anything moves.
+        """
         ...
 
     def stop(self) -> None:
@@ -171,7 +181,7 @@ class Arm(Device, Protocol):
         ...
 
     def kick(self) -> None:
-        """Tell the controller's watchdog that the supervisor is alive. Cheap; called in every supervision period."""
+        """Say that the motion is supervised. Cheap; called in every supervision period."""
         ...
 
     def recover(self) -> None:

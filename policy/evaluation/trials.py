@@ -17,10 +17,10 @@ import cv2
 from policy import make_policy
 from robotcell.config import BackendChoice, JournalPlace
 from robotcell.errors import CellError
-from robotcell.jobs.job import Decision, run_job
+from robotcell.jobs.job import run_job
 from robotcell.jobs.journal import Journal
 from robotcell.jobs.pictures import describe, draw_decision, draw_view
-from robotcell.jobs.verdict import Outcome, Result
+from robotcell.jobs.verdict import Result
 from robotcell.perception.colors import PALETTE
 from sim_twin.devices.backend import open_twin
 
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from policy.evaluation.suites import Case
     from robotcell.cell import Cell
     from robotcell.config import CellConfig
+    from robotcell.jobs.decision import Decision
     from robotcell.jobs.policy_api import Action, Observation, Policy
+    from robotcell.jobs.verdict import Outcome
     from robotcell.perception.view import View
     from sim_twin.world.world import World
 
@@ -76,7 +78,7 @@ class Failure:
 
     Attributes:
         action: what was tried, in words.
-        result: a `robotcell.jobs.job.Result`, or "not complete" of a trial that ended without a failed action.
+        result: a `robotcell.jobs.verdict.Result`, or "not complete" of a trial that ended without a failed action.
         detail: why.
         picture: name of the picture's file.
     """
@@ -236,6 +238,7 @@ class _Timed:
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self.name = policy.name
+        self.workspace = policy.workspace
         self.decisions_s: list[float] = []
 
     def decide(self, observation: Observation) -> Action:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.barred import repeats
+from policy.barred import repeats_grasp, repeats_push
 from policy.grasp_room import Jaw, finger_reach, finger_room, lay_table
 from policy.learned.selection import (
     Candidate,
@@ -29,12 +29,14 @@ from policy.push.outcome import Foresight
 from policy.push.value import Prospects
 from policy.shadows import cell_centers, estimate_surface
 from robotcell.errors import NoTarget
-from robotcell.jobs.policy_api import Action, Primitive
+from robotcell.jobs.policy_api import PickAny, Uncover
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import Push, push_in_workspace
 
 if TYPE_CHECKING:
     from policy.network.inference import Inference
-    from robotcell.config import CellConfig
-    from robotcell.jobs.policy_api import Observation
+    from robotcell.config import CellConfig, Workspace
+    from robotcell.jobs.policy_api import Action, Observation
 
 # A push may come first when the best grasp is less likely to succeed than this (paper: when the largest grasp Q inside
 # the goal's mask is below a threshold).
@@ -96,6 +98,7 @@ class LearnedPolicy:
         self, config: CellConfig, inference: Inference, name: str = "learned", *, may_push: bool = True
     ) -> None:
         self.name = name
+        self._workspace = config.workspace
         self._inference = inference
         self._may_push = may_push
         self._table_height_m = config.table.height_m
@@ -105,6 +108,11 @@ class LearnedPolicy:
         # As far from a grasp as its fingers reach.
         reach = math.ceil(finger_reach(self._jaw.opening_m) / config.workspace.resolution_m)
         self._reach = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+
+    @property
+    def workspace(self) -> Workspace:
+        """That of the cell."""
+        return self._workspace
 
     def decide(self, observation: Observation) -> Action:
         """The best action.
@@ -117,8 +125,10 @@ class LearnedPolicy:
         height_m = observation.heightmap.closed_m
         planes = encode(height_m, observation.heightmap.color)
         may_push = observation.may_push and self._may_push
-        grasp = self._grasp(observation, planes, targets, height_m) if observation.may_grasp else None
-        failed = sum(action.primitive is Primitive.GRASP for action in observation.barred)
+        grasp = None
+        if not isinstance(observation.task, Uncover):
+            grasp = self._grasp(observation, planes, targets, height_m)
+        failed = sum(isinstance(action, Grasp) for action in observation.barred)
         trusted = 0.0 if grasp is None else grasp.q_value * _TRUST**failed
         if may_push and trusted < _GRASP_THRESHOLD:
             push = self._push(observation, planes, targets, height_m)
@@ -137,10 +147,10 @@ class LearnedPolicy:
         planes: npt.NDArray[np.float32],
         targets: npt.NDArray[np.bool_],
         height_m: npt.NDArray[np.float32],
-    ) -> Action | None:
+    ) -> Grasp | None:
         q = self._inference.maps(planes, targets, GRASP)
         check_maps(q, targets, "grasp")
-        mask = _allowed(Primitive.GRASP, observation, targets, len(q))
+        mask = _allowed(observation, targets, len(q))
         rotation, rows, cols, values = best_cells(faded(q, targets), mask, _LOOKED_AT)
         if not len(values):
             return None
@@ -152,8 +162,8 @@ class LearnedPolicy:
         values = values * room**_ROOM_POWER
         chosen = int(values.argmax())
         row, col = int(rows[chosen]), int(cols[chosen])
-        xyz = (*heightmap.workspace.position(row, col), self._table_height_m + surface_at(height_m, (row, col)))
-        return Action(Primitive.GRASP, row, col, int(rotation[chosen]), xyz, float(values[chosen]))
+        x, y = heightmap.workspace.position(row, col)
+        return Grasp(x, y, surface_at(height_m, (row, col)), int(rotation[chosen]), float(values[chosen]))
 
     def _push(
         self,
@@ -168,13 +178,15 @@ class LearnedPolicy:
         free = free_to_descend(height_m, heightmap.workspace)
         foresight = Foresight(observation.labels, heightmap)
         prospects = Prospects(self._inference, foresight, observation.labels, heightmap, self._jaw)
-        if observation.goal is None:
+        task = observation.task
+        if isinstance(task, PickAny):
             middle = middles(observation.labels)
         else:
             middle = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
         # Under one of these a hidden goal is.
-        wanted = set(np.unique(observation.labels[targets]).tolist()) if observation.goal is not None else None
-        lanes, beside = (_LANES, _ASIDE) if observation.may_grasp else (_LANES_TO_SEARCH, math.inf)
+        wanted = set(np.unique(observation.labels[targets]).tolist()) if not isinstance(task, PickAny) else None
+        lanes, beside = (_LANES_TO_SEARCH, math.inf) if isinstance(task, Uncover) else (_LANES, _ASIDE)
+        hiding = targets if isinstance(task, Uncover) else None
         mask = targets
         for _ in range(_PUSH_REACHES):
             mask = push_mask(mask | targets, observation.objects)
@@ -186,17 +198,17 @@ class LearnedPolicy:
             found: list[_Push] = []
             for push in pushes(q, possible, middle, height_m, free, self._push_m, resolution_m, lanes):
                 x, y = (np.array([v]) for v in heightmap.workspace.position(push.line.row, push.line.col))
-                if not repeats(Primitive.PUSH, x, y, np.array([push.rotation]), observation.barred).any():
+                if not repeats_push(x, y, np.array([push.rotation]), observation.barred).any():
                     aims = wanted or {int(observation.labels[push.cell])}
-                    found.append(_play(push, aims, None if observation.may_grasp else targets, foresight, prospects))
+                    found.append(_play(push, aims, hiding, foresight, prospects))
             if found:
                 return max(found, key=_Push.worth)
         return None
 
-    def _push_action(self, observation: Observation, push: Candidate) -> Action:
-        line = push.line
-        xyz = (*observation.heightmap.workspace.position(line.row, line.col), self._table_height_m + line.top_m)
-        return Action(Primitive.PUSH, line.row, line.col, push.rotation, xyz, push.q)
+    def _push_action(self, observation: Observation, push: Candidate) -> Push:
+        line, workspace = push.line, observation.heightmap.workspace
+        start = workspace.position(line.row, line.col)
+        return push_in_workspace(start, push.rotation, self._push_m, line.top_m, push.q, workspace)
 
 
 def _play(
@@ -226,16 +238,14 @@ def _play(
     return _Push(push, gain, promise, loss)
 
 
-def _allowed(
-    primitive: Primitive, observation: Observation, mask: npt.NDArray[np.bool_], rotations: int
-) -> npt.NDArray[np.bool_]:
-    """(K, H, W) the cells of a mask (H, W) in every rotation, less those that would repeat a failure."""
+def _allowed(observation: Observation, mask: npt.NDArray[np.bool_], rotations: int) -> npt.NDArray[np.bool_]:
+    """(K, H, W) the cells of a mask (H, W) in every rotation, less the grasps that would repeat a failure."""
     allowed = np.broadcast_to(mask, (rotations, *mask.shape))
     if not observation.barred:
         return allowed
     rows, cols = np.nonzero(mask)
     x, y = cell_centers(observation.heightmap.workspace, rows, cols)
-    failed = repeats(primitive, x[None], y[None], np.arange(rotations)[:, None], observation.barred)
+    failed = repeats_grasp(x[None], y[None], np.arange(rotations)[:, None], observation.barred)
     allowed = allowed.copy()
     allowed[:, rows, cols] &= ~failed
     return np.asarray(allowed, np.bool_)

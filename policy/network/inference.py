@@ -13,14 +13,15 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from policy.network.precision import autocast
-from policy.network.q_network import GRASP, GRASP_ROTATIONS, PUSH, PUSH_ROTATIONS
+from policy.network.q_network import GRASP, PUSH
 from policy.network.rotation import MARGIN, Copies
 from policy.network.weights import load_weights
+from robotcell.motion.rotations import GRASP_ROTATIONS, ROTATIONS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-_PLANES = {GRASP: GRASP_ROTATIONS, PUSH: PUSH_ROTATIONS}
+_PLANES = {GRASP: GRASP_ROTATIONS, PUSH: ROTATIONS}
 # Cells of copies that pass the network at once: what the paper's network keeps of them takes 1 GB. Neither network is
 # faster on more.
 _CELLS_AT_ONCE = 2**19

@@ -13,16 +13,12 @@ from torch import nn
 from torch.nn import functional
 
 from policy.network.encoding import CHANNELS
-from robotcell.motion.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 # Channels of the Q maps.
 GRASP, PUSH = 0, 1
-# The jaw is symmetric: half a turn changes nothing.
-GRASP_ROTATIONS = ROTATIONS // 2
-PUSH_ROTATIONS = ROTATIONS
 
 # The network works on blocks of 4 x 4 cells (8 mm), with all that is in them as channels.
 _FOLD = 4

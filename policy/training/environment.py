@@ -31,6 +31,7 @@ from robotcell.motion.grasp import grasp_height
 from robotcell.motion.push import push_height
 from robotcell.motion.rotations import ROTATIONS
 from robotcell.motion.tool import near_height
+from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 from robotcell.perception.segmentation import MIN_OBJECT_M
 from sim_twin.devices.camera import TwinCamera
@@ -258,7 +259,9 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         label = index_of[visual]
         bits = {str(bit): (label >> bit & 1).astype(np.bool_) for bit in range(_BITS)}
         config = self._config
-        heightmap = build_heightmap(frame, self._T_base_camera, config.workspace, config.table.height_m, bits)
+        heightmap = build_heightmap(
+            frame, CalibratedCamera(self._T_base_camera), config.workspace, config.table.height_m, bits
+        )
         labels = np.zeros(config.workspace.shape, np.uint8)
         for bit in range(_BITS):
             labels |= heightmap.masks[str(bit)].astype(np.uint8) << np.uint8(bit)

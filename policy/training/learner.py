@@ -16,10 +16,11 @@ from torch.nn import functional
 from policy.learned.selection import best_cells, faded
 from policy.network.encoding import encode
 from policy.network.precision import autocast
-from policy.network.q_network import GRASP, GRASP_ROTATIONS, PUSH
+from policy.network.q_network import GRASP, PUSH
 from policy.network.rotation import MARGIN, Copies
 from policy.training.augment import crop
 from policy.training.shard import unpack_height
+from robotcell.motion.rotations import GRASP_ROTATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,7 +1,7 @@
 """The twin's UR5e: position-controlled joints of limited torque that follow trapezoidal profiles.
 
 It refuses what the controller refuses, and stops by itself where the controller does: on a contact force, on a joint
-that cannot follow, and when the supervisor falls silent.
+that cannot follow, on a line that its kinematics cannot follow, and when nobody supervises the motion.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ import numpy as np
 
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import controller_ranges, rg2, ur5e
-from robotcell.geometry.transforms import Array, interpolate_transforms, invert_transform, rotation_angle
-from robotcell.interfaces import Arm, ArmMode, ArmState
+from robotcell.geometry.transforms import interpolate_transforms, invert_transform, rotation_angle
+from robotcell.interfaces import KICK_TIMEOUT_S, Arm, ArmMode, ArmState
 from sim_twin.devices.trajectory import slow_down, trapezoid
 from sim_twin.world import robot_model
 from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
+    from robotcell.interfaces import Array
     from sim_twin.world.world import World
 
 # A stop brakes the tool at 10 m/s^2 (what ur_rtde passes to stopl), here 0.5 m from the joint that turns fastest.
@@ -28,7 +29,9 @@ STOP_DECELERATION_RAD_S2 = 20.0
 PROTECTIVE_FORCE_N = 150.0
 # A joint this far from where it should be could not follow: its motor is at its limit. Assumed.
 TRACKING_ERROR_RAD = 0.05
-WATCHDOG_S = 0.1
+# Half more than at the fastest joint speed: a target that leaps further within a period is no path. The real controller
+# stops with "path sanity check failed"; its threshold is not public. Assumed.
+MAX_TARGET_SPEED_RAD_S = 1.5 * ur5e.MAX_JOINT_SPEED
 # A motion that starts pressed against something may press this much more. Assumed.
 LEAVING_FORCE_N = 30.0
 
@@ -51,9 +54,11 @@ class TwinArm(Arm):
         # The motion under way: (N, 6) joint angles, one per step, and the sample that was commanded last.
         self._path: Array = np.empty((0, 6))
         self._index = 0
+        # Whether the path ends where the arm cannot follow the motion any further.
+        self._breaks_off = False
         self._braking = False
         self._force_limit_n = PROTECTIVE_FORCE_N
-        self._kicked_at: float | None = None
+        self._kicked_at = 0.0
 
     def connect(self) -> None:
         """Attach to the world and hold the arm where it is. Does nothing when connected."""
@@ -63,7 +68,6 @@ class TwinArm(Arm):
             self._world.attach(self)
             self._joints = self._world.joint_index(robot_model.ARM_JOINTS)
             self._mode = ArmMode.READY
-            self._kicked_at = None
             self._hold()
             self._world.add_controller(self._control)
             self._connected = True
@@ -83,7 +87,7 @@ class TwinArm(Arm):
     def moving(self) -> bool:
         """Whether a motion, or the braking that ends it, is under way."""
         self._need_connection()
-        return self._index < len(self._path) - 1
+        return self._breaks_off or self._index < len(self._path) - 1
 
     def state(self) -> ArmState:
         """The state after the last step.
@@ -122,9 +126,11 @@ class TwinArm(Arm):
     def start_linear(self, T_base_tcp: Array, speed_m_s: float, acceleration_m_s2: float) -> None:
         """Start a straight motion of the tcp; see `Arm`.
 
+        Where a pose on the way is out of reach, or a joint would have to leap, the arm comes that far and then makes a
+        protective stop.
+
         Raises:
-            UnsafeMotion: the pose is no rigid transform, it or a pose on the way is out of reach or singular, a joint
-                would have to turn faster than it can, speed or acceleration are outside the controller's range, or
+            UnsafeMotion: the pose is no rigid transform, speed or acceleration are outside the controller's range, or
                 the arm is moving.
             DeviceFault: the arm is stopped.
         """
@@ -137,13 +143,8 @@ class TwinArm(Arm):
         s = trapezoid(distance, speed_m_s, acceleration_m_s2, STEP_S)
         if not len(s):
             return
-        poses = interpolate_transforms(T_start, T_goal, s / distance) @ _T_TCP_FLANGE
-        try:
-            path = ur5e.inverse_along(poses, q, controller_ranges.BRANCH_STEP_RAD)
-        except ValueError as error:
-            raise UnsafeMotion(f"straight motion refused: {error}") from None
-        controller_ranges.check_joint_speeds(np.abs(np.diff(path, axis=0, prepend=q[None])) / STEP_S)
-        self._start(path)
+        path = _followed(interpolate_transforms(T_start, T_goal, s / distance) @ _T_TCP_FLANGE, q)
+        self._start(path, breaks_off=len(path) < len(s))
 
     def stop(self) -> None:
         """Brake along the path at `STOP_DECELERATION_RAD_S2`."""
@@ -152,10 +153,11 @@ class TwinArm(Arm):
             rest = slow_down(self._path, self._index, STOP_DECELERATION_RAD_S2, STEP_S)
             self._path = np.vstack([self._path[self._index], rest])
             self._index = 0
+            self._breaks_off = False
             self._braking = True
 
     def kick(self) -> None:
-        """Arm the watchdog: from now on a motion stops when no kick comes for `WATCHDOG_S` of simulated time."""
+        """Keep the motion going: one that is not kicked for `KICK_TIMEOUT_S` of simulated time stops."""
         self._need_connection()
         self._kicked_at = self._world.time_s
 
@@ -166,31 +168,30 @@ class TwinArm(Arm):
             self._hold()
             self._mode = ArmMode.READY
 
-    def _start(self, path: Array) -> None:
+    def _start(self, path: Array, *, breaks_off: bool = False) -> None:
         self._path = np.vstack([self._path[-1], path])
         self._index = 0
+        self._breaks_off = breaks_off
         self._braking = False
         # More than at the start, so that the arm can leave a contact that stopped it.
         at_start = _norm(self._world.contact().robot_force)
         self._force_limit_n = max(PROTECTIVE_FORCE_N, at_start + LEAVING_FORCE_N)
-        if self._kicked_at is not None:
-            self._kicked_at = self._world.time_s
+        self._kicked_at = self._world.time_s
 
     def _control(self) -> None:
         """One control period: watch, also an arm at rest; then command the next sample."""
         if self._mode is ArmMode.READY and self._must_protect():
             self._hold()
             self._mode = ArmMode.PROTECTIVE_STOP
-        if self._index >= len(self._path) - 1:
-            return
-        if self._kicked_at is not None and self._world.time_s - self._kicked_at > WATCHDOG_S:
+        if self.moving and not self._braking and self._world.time_s - self._kicked_at > KICK_TIMEOUT_S:
             self.stop()
-            if self._index >= len(self._path) - 1:
-                return
-        self._index += 1
-        self._command(self._path[self._index])
+        if self._index < len(self._path) - 1:
+            self._index += 1
+            self._command(self._path[self._index])
 
     def _must_protect(self) -> bool:
+        if self._breaks_off and self._index == len(self._path) - 1:
+            return True
         if _norm(self._world.contact().robot_force) > self._force_limit_n:
             return True
         q, _ = self._world.joint_states(self._joints)
@@ -200,6 +201,7 @@ class TwinArm(Arm):
         q, _ = self._world.joint_states(self._joints)
         self._path = q[None]
         self._index = 0
+        self._breaks_off = False
         self._braking = False
         self._command(q)
 
@@ -220,3 +222,14 @@ class TwinArm(Arm):
 
 def _norm(vector: Array) -> float:
     return math.sqrt(float(vector @ vector))
+
+
+def _followed(T_base_flange: Array, q_start: Array) -> Array:
+    """Joint angles (M, 6) along flange poses (N, 4, 4), one per step: as many as the arm can follow, M <= N."""
+    path = [q_start]
+    for T in T_base_flange:
+        q = ur5e.inverse(T, path[-1])
+        if q is None or float(np.abs(q - path[-1]).max()) > MAX_TARGET_SPEED_RAD_S * STEP_S:
+            break
+        path.append(q)
+    return np.array(path[1:]).reshape(-1, 6)

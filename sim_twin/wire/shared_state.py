@@ -15,7 +15,11 @@ from robotcell.io.shared_record import SharedRecord, record_size
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
 
-# Written by the UR controller, read by the world. `powered`: the joints follow `q`; else the brakes hold them.
+# The control period of the UR controller [s]: 500 Hz (Universal Robots, e-Series).
+PERIOD_S = 0.002
+
+# Written by the UR controller once per control period, read by the world. `powered`: the joints follow `q`; else the
+# brakes hold them.
 # `T_flange_tcp` is what the program set, `payload_kg` too; the world only reports by them.
 ARM_COMMAND = np.dtype(
     [("tick", "u8"), ("powered", "u1"), ("q", "f8", 6), ("T_flange_tcp", "f8", (4, 4)), ("payload_kg", "f8")]

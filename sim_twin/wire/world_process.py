@@ -13,8 +13,7 @@ from robotcell.errors import CellError
 from sim_twin.devices.arm import JOINT_GAINS
 from sim_twin.devices.gripper import TwinGripper
 from sim_twin.options import TwinOptions
-from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, GRIPPER_COMMAND, Record, poses_dtype
-from sim_twin.wire.ur.motion import PERIOD_S
+from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, GRIPPER_COMMAND, PERIOD_S, Record, poses_dtype
 from sim_twin.world import robot_model
 from sim_twin.world.simulation import STEP_S
 from sim_twin.world.world import World

@@ -30,8 +30,6 @@ from robotcell.config import load_config
 from robotcell.motion.rotations import ROTATIONS
 from robotcell.perception.goals import find_goal
 from robotcell.perception.heightmap import Heightmap
-from robotcell.perception.segmentation import segment
-from robotcell.perception.view import look
 from sim_twin.scenes.catalog import scene_names
 
 KINDS = ("enclosed", "packed")
@@ -74,8 +72,8 @@ def challenging() -> Iterator[View]:
             continue
         config = load_config(None, {"backend.options.scene": name})
         with open_cell(config) as cell:
-            heightmap = look(cell).heightmap
-        seen = segment(heightmap)
+            view = cell.look()
+        heightmap, seen = view.heightmap, view.segmentation
         yield View(heightmap, seen.labels, find_goal(seen, "red").label)
 
 

@@ -27,7 +27,7 @@ from policy.training.environment import Outcome, PushGraspEnv
 from policy.training.learner import auc
 from robotcell.config import load_config
 from robotcell.errors import NoTarget
-from robotcell.jobs.policy_api import Observation
+from robotcell.jobs.policy_api import Observation, PickGoal
 from robotcell.motion.rotations import ROTATIONS
 
 KINDS = ("enclosed", "packed")
@@ -58,10 +58,10 @@ class Ranking:
             return False
         labels = state.labels.astype(np.int32)
         try:
-            action = self.policy.decide(Observation(state.heightmap, labels, labels == goal, (), may_push=False))
+            action = self.policy.decide(Observation(state.heightmap, labels, PickGoal(labels == goal), may_push=False))
         except NoTarget:
             return False
-        held = goal in env.attempt(GRASP, action.rotation, (action.row, action.col)).held
+        held = goal in env.attempt(GRASP, action.rotation, CONFIG.workspace.cell(action.x, action.y)).held
         self.grasps.append((action.q_value, held))
         return held
 

@@ -10,11 +10,10 @@ import pytest
 from policy import make_policy
 from robotcell.cell import Cell, open_cell
 from robotcell.config import load_config
-from robotcell.jobs.policy_api import Action, Observation, Primitive
-from robotcell.motion.executor import Executor
+from robotcell.jobs.policy_api import Observation, PickAny
+from robotcell.motion.actions import Action, plan_action
+from robotcell.motion.grasp import Grasp
 from robotcell.motion.path_check import CheckedPlan, check_path
-from robotcell.motion.plan import plan_action
-from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
 
     from robotcell.jobs.policy_api import Policy
+    from robotcell.perception.view import View
 
 ROUNDS = 7
 
@@ -34,14 +34,12 @@ class Bench:
     policy: Policy
 
     def look(self) -> View:
-        return look(self.cell)
+        return self.cell.look(self.policy.workspace)
 
     def decide(self, view: View) -> Action:
         """The best grasp; pushes would make the rounds unlike each other."""
-        action = self.policy.decide(
-            Observation(view.heightmap, view.segmentation.labels, None, barred=(), may_push=False)
-        )
-        assert action.primitive is Primitive.GRASP
+        action = self.policy.decide(Observation(view.heightmap, view.segmentation.labels, PickAny(), may_push=False))
+        assert isinstance(action, Grasp)
         return action
 
     def plan(self, view: View, action: Action) -> CheckedPlan:
@@ -49,7 +47,7 @@ class Bench:
         return check_path(plan, self.cell.config)
 
     def run(self, checked: CheckedPlan) -> None:
-        Executor(self.cell).run(checked)
+        self.cell.executor.run(checked)
 
     def whole(self) -> None:
         view = self.look()

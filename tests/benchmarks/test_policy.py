@@ -27,7 +27,10 @@ from policy.push.value import Prospects
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.errors import NoTarget
-from robotcell.jobs.policy_api import Observation, Primitive
+from robotcell.jobs.policy_api import Observation, PickGoal
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import Push
+from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.goals import find_goal
 from robotcell.perception.heightmap import build_heightmap, close_gaps
 from robotcell.perception.segmentation import segment
@@ -50,7 +53,7 @@ def frame(config):
 
 @pytest.fixture(scope="module")
 def heightmap(config, frame):
-    return build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+    return build_heightmap(frame, CalibratedCamera.of(config.camera), config.workspace, config.table.height_m)
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +69,11 @@ def inference():
 def observe(heightmap, *, may_push=True):
     segmentation = segment(heightmap)
     goal = find_goal(segmentation, segmentation.instances[0].color_name)
-    return Observation(heightmap, segmentation.labels, segmentation.mask(goal), (), may_push=may_push)
+    return Observation(heightmap, segmentation.labels, PickGoal(segmentation.mask(goal)), may_push=may_push)
 
 
 def frame_to_action(config, frame, policy, *, may_push=True):
-    heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+    heightmap = build_heightmap(frame, CalibratedCamera.of(config.camera), config.workspace, config.table.height_m)
     return policy.decide(observe(heightmap, may_push=may_push))
 
 
@@ -79,7 +82,7 @@ def test_encode(benchmark, heightmap):
 
 
 def test_grasp_maps(benchmark, heightmap, inference):
-    planes, goal = encode(heightmap.closed_m, heightmap.color), observe(heightmap).goal
+    planes, goal = encode(heightmap.closed_m, heightmap.color), observe(heightmap).targets()
     assert np.isfinite(benchmark(inference.maps, planes, goal, GRASP)[:, goal]).all()
 
 
@@ -87,8 +90,8 @@ def test_push_maps(benchmark, config, heightmap, inference):
     """Near the middle of the goal, as the policy asks for them."""
     planes, observation = encode(heightmap.closed_m, heightmap.color), observe(heightmap)
     free = free_to_descend(heightmap.closed_m, config.workspace)
-    mask = push_mask(observation.goal, observation.objects)
-    middle = np.broadcast_to(np.argwhere(observation.goal).mean(axis=0), (*mask.shape, 2))
+    mask = push_mask(observation.targets(), observation.objects)
+    middle = np.broadcast_to(np.argwhere(observation.targets()).mean(axis=0), (*mask.shape, 2))
     possible = possible_pushes(mask, middle, free, config.motion.push_m, config.workspace.resolution_m, beside=8)
     assert np.isfinite(benchmark(inference.maps, planes, possible, PUSH)[possible]).all()
 
@@ -96,10 +99,10 @@ def test_push_maps(benchmark, config, heightmap, inference):
 def test_play(benchmark, config, heightmap, inference):
     """One push, and what it promises for the goal."""
     observation = observe(heightmap)
-    goal, height_m = int(observation.labels[observation.goal].max()), heightmap.closed_m
+    goal, height_m = int(observation.labels[observation.targets()].max()), heightmap.closed_m
     resolution_m = config.workspace.resolution_m
     free = free_to_descend(height_m, config.workspace)
-    cells = np.argwhere(push_mask(observation.goal, observation.objects)).tolist()
+    cells = np.argwhere(push_mask(observation.targets(), observation.objects)).tolist()
     lines = (push_line(height_m, free, cell, 0, config.motion.push_m, resolution_m) for cell in cells)
     line = next(line for line in lines if line is not None)
     foresight = Foresight(observation.labels, heightmap)
@@ -114,20 +117,18 @@ def test_play(benchmark, config, heightmap, inference):
 
 
 # The goal of this frame needs a push; where none is allowed, the decision costs what a clear grasp costs.
-decisions = pytest.mark.parametrize(
-    ("may_push", "primitive"), [(False, Primitive.GRASP), (True, Primitive.PUSH)], ids=["grasp", "push"]
-)
+decisions = pytest.mark.parametrize(("may_push", "kind"), [(False, Grasp), (True, Push)], ids=["grasp", "push"])
 
 
 @decisions
-def test_decide(benchmark, heightmap, policy, may_push, primitive):
+def test_decide(benchmark, heightmap, policy, may_push, kind):
     observation = observe(heightmap, may_push=may_push)
-    assert benchmark(policy.decide, observation).primitive is primitive
+    assert isinstance(benchmark(policy.decide, observation), kind)
 
 
 @decisions
-def test_frame_to_action(benchmark, config, frame, policy, may_push, primitive):
-    assert benchmark(frame_to_action, config, frame, policy, may_push=may_push).primitive is primitive
+def test_frame_to_action(benchmark, config, frame, policy, may_push, kind):
+    assert isinstance(benchmark(frame_to_action, config, frame, policy, may_push=may_push), kind)
 
 
 def test_frames_to_actions(benchmark):
@@ -143,21 +144,20 @@ def test_frames_to_actions(benchmark):
             policy = make_policy("learned", config)
             for _ in range(ROUNDS // 4):
                 started = time.perf_counter()
-                heightmap = build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+                heightmap = build_heightmap(
+                    frame, CalibratedCamera.of(config.camera), config.workspace, config.table.height_m
+                )
                 segmentation = segment(heightmap)
                 try:
                     goal = segmentation.mask(find_goal(segmentation, "red"))
                 except NoTarget:
                     break
-                action = policy.decide(Observation(heightmap, segmentation.labels, goal, (), may_push=True))
-                times[action.primitive].append(time.perf_counter() - started)
+                action = policy.decide(Observation(heightmap, segmentation.labels, PickGoal(goal)))
+                times[type(action).__name__.lower()].append(time.perf_counter() - started)
 
     benchmark.pedantic(decide_all, rounds=1)
     every = [seconds for found in times.values() for seconds in found]
-    parts = [
-        f"{primitive.value} {1000 * statistics.median(found):.0f} ms ({len(found)})"
-        for primitive, found in times.items()
-    ]
+    parts = [f"{kind} {1000 * statistics.median(found):.0f} ms ({len(found)})" for kind, found in times.items()]
     sys.stdout.write(f"\nframe to action, median: {', '.join(parts)}, all {1000 * statistics.median(every):.0f} ms\n")
 
 

@@ -11,7 +11,8 @@ from policy import make_policy
 from policy.shadows import estimate_surface
 from robotcell.cell import open_cell
 from robotcell.config import load_config
-from robotcell.jobs.policy_api import Observation
+from robotcell.jobs.policy_api import Observation, PickAny, PickGoal
+from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.goals import find_goal
 from robotcell.perception.heightmap import build_heightmap
 from robotcell.perception.segmentation import segment
@@ -37,14 +38,14 @@ def look(resolution):
 
 def heightmap_of(look):
     config, frame = look
-    return build_heightmap(frame, config.camera.pose(), config.workspace, config.table.height_m)
+    return build_heightmap(frame, CalibratedCamera.of(config.camera), config.workspace, config.table.height_m)
 
 
 def observe(heightmap, *, goal):
     segmentation = segment(heightmap)
     largest = segmentation.instances[0]
-    mask = segmentation.mask(find_goal(segmentation, largest.color_name)) if goal else None
-    return Observation(heightmap, segmentation.labels, mask, (), True)
+    task = PickGoal(segmentation.mask(find_goal(segmentation, largest.color_name))) if goal else PickAny()
+    return Observation(heightmap, segmentation.labels, task)
 
 
 @RESOLUTIONS

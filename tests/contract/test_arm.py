@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from robotcell.errors import ConnectionLost, UnsafeMotion
+from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import make_transform, rotation_angle, rotation_z
-from robotcell.interfaces import ArmMode
+from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from robotcell.cell import Cell
     from robotcell.geometry.transforms import Array
+    from tests.contract.conftest import Opened
 
 PERIOD_S = 0.008
 
@@ -148,6 +149,24 @@ def test_the_watchdog_stops_an_arm_whose_supervisor_fell_silent(cell: Cell, pace
     assert cell.arm.state().q[0] < q[0] + 0.25
 
 
+def test_a_motion_that_nobody_ever_kicks_stops(closed_cell: Cell, pace: float) -> None:
+    with closed_cell.arm as arm, closed_cell.gripper:
+        start = arm.state().q[0]
+        begin = closed_cell.clock.now()
+        arm.start_joints(arm.state().q + np.array((0.3, 0, 0, 0, 0, 0)), 0.5 * pace, 1.4 * pace**2)
+        while arm.moving and closed_cell.clock.now() - begin < 2.0:
+            closed_cell.clock.sleep(PERIOD_S)
+        # The motion takes 0.96 s. In real time a busy machine notices the silence, and the standstill, late.
+        assert KICK_TIMEOUT_S < closed_cell.clock.now() - begin < KICK_TIMEOUT_S + 0.5
+        assert not arm.moving
+        turned = arm.state().q[0] - start
+        assert turned < 0.2
+        assert arm.state().mode is ArmMode.READY
+        arm.start_joints(arm.state().q - np.array((turned, 0, 0, 0, 0, 0)), 0.5 * pace, 1.4 * pace**2)
+        finish(closed_cell)
+        assert arm.state().q[0] == pytest.approx(start, abs=2e-3)
+
+
 BAD_JOINTS = [np.zeros(5), np.full(6, np.nan), np.array([7.0, 0, 0, 0, 0, 0]), np.array([0, 0, 3.2, 0, 0, 0])]
 
 
@@ -169,15 +188,28 @@ def test_refuses_speeds_and_accelerations_outside_its_range(cell: Cell, value: f
     assert not cell.arm.moving
 
 
-def test_refuses_poses_that_are_none_or_out_of_reach(cell: Cell, pace: float) -> None:
+def test_refuses_poses_that_are_none(cell: Cell, pace: float) -> None:
     T = cell.arm.state().T_base_tcp
-    far = T.copy()
-    far[:3, 3] = (-2.0, 0.0, 0.3)
     mirrored = T @ np.diag([1.0, 1.0, -1.0, 1.0])
-    for pose in (far, mirrored, T[:3], np.full((4, 4), np.nan)):
+    for pose in (mirrored, T[:3], np.full((4, 4), np.nan)):
         with pytest.raises(UnsafeMotion):
             cell.arm.start_linear(pose, 0.1 * pace, 0.5 * pace**2)
     assert not cell.arm.moving
+
+
+def test_a_line_out_of_reach_leaves_an_arm_that_must_be_recovered(closed_cell: Cell, opened: Opened) -> None:
+    if opened.real:
+        pytest.skip("a real arm is not sent to the end of its reach")
+    with closed_cell.arm as arm, closed_cell.gripper:
+        far = arm.state().T_base_tcp.copy()
+        far[:3, 3] = (-2.0, 0.0, 0.3)
+        arm.start_linear(far, 0.5, 1.0)
+        finish(closed_cell)
+        assert arm.state().mode is not ArmMode.READY
+        with pytest.raises(DeviceFault):
+            arm.start_linear(far, 0.5, 1.0)
+        arm.recover()
+        assert arm.state().mode is ArmMode.READY
 
 
 def test_recover_does_nothing_to_an_arm_that_is_ready(cell: Cell) -> None:

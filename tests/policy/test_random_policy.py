@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from policy import make_policy
 from robotcell.config import CellConfig, Table, Workspace
 from robotcell.errors import NoTarget
-from robotcell.jobs.policy_api import Observation, Primitive
+from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import Push
 from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
@@ -25,15 +27,20 @@ def look(*boxes, goal=None, barred=(), may_push=True, workspace=None):
     for number, (row, col, side, height_m) in enumerate(boxes, start=1):
         heights[row : row + side, col : col + side] = height_m
         labels[row : row + side, col : col + side] = number
-    mask = None if goal is None else labels == goal
-    return Observation(heightmap(heights, workspace), labels, mask, barred, may_push)
+    task = PickAny() if goal is None else PickGoal(labels == goal)
+    return Observation(heightmap(heights, workspace), labels, task, barred, may_push)
+
+
+def place(action):
+    """(x, y) of the middle between the fingers, or of the start of a push."""
+    return (action.x, action.y) if isinstance(action, Grasp) else action.start
 
 
 def same(one, other):
-    period = 8 if one.primitive is Primitive.GRASP else 16
+    period = 8 if isinstance(one, Grasp) else 16
     turn = (one.rotation - other.rotation) % period
-    near = math.dist(one.xyz[:2], other.xyz[:2]) < 0.02
-    return one.primitive is other.primitive and near and min(turn, period - turn) <= 1
+    near = math.dist(place(one), place(other)) < 0.02
+    return type(one) is type(other) and near and min(turn, period - turn) <= 1
 
 
 PAIR = ((40, 60, 25, 0.05), (120, 150, 20, 0.03))
@@ -42,20 +49,21 @@ PAIR = ((40, 60, 25, 0.05), (120, 150, 20, 0.03))
 def test_draws_are_spread_over_primitives_cells_and_rotations():
     policy, scene = make_policy("random", CONFIG), look(*PAIR)
     actions = [policy.decide(scene) for _ in range(600)]
-    primitives = Counter(action.primitive for action in actions)
-    assert min(primitives.values()) > 250
-    for primitive, rotations in ((Primitive.GRASP, 8), (Primitive.PUSH, 16)):
-        turns = Counter(action.rotation for action in actions if action.primitive is primitive)
+    kinds = Counter(type(action) for action in actions)
+    assert min(kinds.values()) > 250
+    for kind, rotations in ((Grasp, 8), (Push, 16)):
+        turns = Counter(action.rotation for action in actions if isinstance(action, kind))
         assert sorted(turns) == list(range(rotations))
-        assert max(turns.values()) < 3 * primitives[primitive] / rotations
-    on_first = [scene.labels[a.row, a.col] == 1 for a in actions if a.primitive is Primitive.GRASP]
+        assert max(turns.values()) < 3 * kinds[kind] / rotations
+    on_first = [scene.labels[Workspace().cell(a.x, a.y)] == 1 for a in actions if isinstance(a, Grasp)]
     assert np.mean(on_first) == pytest.approx(625 / 1025, abs=0.08)  # by area
     assert {action.q_value for action in actions} == {0.0}
 
 
 def test_what_may_not_be_grasped_is_pushed():
-    policy, scene = make_policy("random", CONFIG), replace(look(*PAIR, goal=1), may_grasp=False)
-    assert {policy.decide(scene).primitive for _ in range(20)} == {Primitive.PUSH}
+    policy, scene = make_policy("random", CONFIG), look(*PAIR)
+    scene = replace(scene, task=Uncover(scene.labels == 1))
+    assert {type(policy.decide(scene)) for _ in range(20)} == {Push}
 
 
 @settings(max_examples=30)
@@ -65,30 +73,31 @@ def test_what_may_not_be_grasped_is_pushed():
 def test_an_action_is_where_it_says_and_where_it_may_be(goal, may_push, table_m, draws):
     scene = look(*PAIR, goal=goal, may_push=may_push)
     policy = make_policy("random", CellConfig(table=Table(height_m=table_m)))
-    targets = scene.objects if goal is None else scene.goal
+    targets = scene.targets()
     tops = {1: 0.05, 2: 0.03}
     for _ in range(draws):
         action = policy.decide(scene)
-        assert Workspace().cell(*action.xyz[:2]) == (action.row, action.col)
-        assert may_push or action.primitive is Primitive.GRASP
-        if action.primitive is Primitive.GRASP:
-            assert targets[action.row, action.col]
-            top = tops[scene.labels[action.row, action.col]]
+        row, col = Workspace().cell(*place(action))
+        assert Workspace().position(row, col) == pytest.approx(place(action))
+        assert may_push or isinstance(action, Grasp)
+        if isinstance(action, Grasp):
+            assert targets[row, col]
+            assert action.surface_m == pytest.approx(tops[scene.labels[row, col]], abs=1e-6)
         else:
-            assert not scene.objects[action.row, action.col]
+            assert not scene.objects[row, col]
             rows, cols = np.nonzero(targets)
-            nearest = np.maximum(abs(rows - action.row), abs(cols - action.col)).argmin()
-            assert max(abs(rows[nearest] - action.row), abs(cols[nearest] - action.col)) <= 15
-            top = tops[scene.labels[rows[nearest], cols[nearest]]]
-        assert action.xyz[2] == pytest.approx(table_m + top, abs=1e-6)
+            nearest = np.maximum(abs(rows - row), abs(cols - col)).argmin()
+            assert max(abs(rows[nearest] - row), abs(cols[nearest] - col)) <= 15
+            assert action.top_m == pytest.approx(tops[scene.labels[rows[nearest], cols[nearest]]], abs=1e-6)
 
 
 def test_the_reach_of_pushes_is_in_metres():
     workspace = Workspace(resolution_m=0.005)
     policy = make_policy("random", CellConfig(workspace=workspace))
     scene = look((40, 40, 10, 0.05), workspace=workspace)
-    pushes = [a for a in (policy.decide(scene) for _ in range(300)) if a.primitive is Primitive.PUSH]
-    reach = max(max(40 - a.row, a.row - 49, 40 - a.col, a.col - 49) for a in pushes)
+    pushes = [a for a in (policy.decide(scene) for _ in range(300)) if isinstance(a, Push)]
+    cells = [workspace.cell(*push.start) for push in pushes]
+    reach = max(max(40 - row, row - 49, 40 - col, col - 49) for row, col in cells)
     assert reach == 6
 
 
@@ -118,7 +127,7 @@ def test_what_failed_is_not_repeated_until_nothing_is_left(may_push):
 def test_an_object_that_fills_the_map_can_only_be_grasped():
     policy = make_policy("random", CONFIG)
     full = look((0, 0, 224, 0.05))
-    assert {policy.decide(full).primitive for _ in range(20)} == {Primitive.GRASP}
+    assert {type(policy.decide(full)) for _ in range(20)} == {Grasp}
 
 
 def test_nothing_to_act_on():

@@ -23,7 +23,10 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_importing_the_package_costs_nothing() -> None:
-    code = "import sys, robotcell; heavy = {'numpy', 'cv2', 'scipy', 'pydantic'} & set(sys.modules); assert not heavy, heavy"
+    code = (
+        "import sys, robotcell; "
+        "heavy = {'numpy', 'cv2', 'scipy', 'pydantic'} & set(sys.modules); assert not heavy, heavy"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

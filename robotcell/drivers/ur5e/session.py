@@ -13,6 +13,7 @@ from robotcell.drivers.ur5e.clock_offset import ClockOffset
 from robotcell.drivers.ur5e.controller import IN_USE_CURE, PLAYING, PROTECTIVE_STOP, STOPPED
 from robotcell.drivers.ur5e.messages import STATE, SUPERVISION, SUPERVISION_OFFSET, StartJoints
 from robotcell.errors import ConnectionLost
+from robotcell.interfaces import KICK_TIMEOUT_S
 from robotcell.io.shared_record import SharedRecord
 
 if TYPE_CHECKING:
@@ -41,8 +42,6 @@ _VARIABLES = [
 _MOVING_WATCHDOG_HZ = 8.0
 _IDLE_WATCHDOG_HZ = 1.0
 _KICK_PERIOD_S = 0.02
-# A motion is stopped when the driver has not kicked for this long.
-_SUPERVISION_S = 0.2
 _PROGRAM_STARTS_S = 4.0
 _SETTING_APPLIES_S = 1.0
 # A motion that was accepted begins within some milliseconds.
@@ -214,7 +213,7 @@ class Session:
             if self._stop():
                 self._stops = int(supervision["stops"])
                 self._state.write(stops=self._stops)
-        elif self._moving and not self._stop_sent and now - float(supervision["kicked"]) > _SUPERVISION_S:
+        elif self._moving and not self._stop_sent and now - float(supervision["kicked"]) > KICK_TIMEOUT_S:
             self._stop()
         if self._interrupted:
             return

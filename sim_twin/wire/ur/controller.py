@@ -6,17 +6,20 @@ safeguard stop pauses the program.
 
 from __future__ import annotations
 
-import enum
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim_twin.devices.arm import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
-from sim_twin.wire.ur.motion import PERIOD_S, Arm, ScriptError
-from sim_twin.wire.ur.variables import BIT_REGISTERS, REGISTERS
+from sim_twin.wire.shared_state import PERIOD_S
+from sim_twin.wire.ur.arm import Arm
+from sim_twin.wire.ur.history import History
+from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
+from sim_twin.wire.ur.program import ScriptError
+from sim_twin.wire.ur.registers import Outputs, Payload, Registers
 
 if TYPE_CHECKING:
     from collections.abc import Container, Sequence
@@ -37,80 +40,8 @@ _BRAKE_RELEASE_S = 0.5
 _RATE_SLOPE = 6.0
 # What the arm does is compared with the targets of this many periods before it was measured: it follows with a delay.
 _TRACKING_PERIODS = 20
-_HISTORY_PERIODS = 500
 # When the world has not stepped for so long, the time of motions stands still too; the arm could not follow them.
 _WORLD_STALLS_S = 0.015
-# A force on the tool that counts as contact. Assumed; the real detection also looks at the motor currents.
-_CONTACT_FORCE_N = 10.0
-
-
-class RobotMode(enum.IntEnum):
-    """robot_mode of RTDE."""
-
-    NO_CONTROLLER = -1
-    DISCONNECTED = 0
-    CONFIRM_SAFETY = 1
-    BOOTING = 2
-    POWER_OFF = 3
-    POWER_ON = 4
-    IDLE = 5
-    BACKDRIVE = 6
-    RUNNING = 7
-    UPDATING_FIRMWARE = 8
-
-
-class SafetyMode(enum.IntEnum):
-    """safety_mode of RTDE, as far as the twin knows them."""
-
-    NORMAL = 1
-    PROTECTIVE_STOP = 3
-    SAFEGUARD_STOP = 5
-    ROBOT_EMERGENCY_STOP = 7
-    VIOLATION = 8
-
-
-class RuntimeState(enum.IntEnum):
-    """runtime_state of RTDE."""
-
-    STOPPING = 0
-    STOPPED = 1
-    PLAYING = 2
-    PAUSING = 3
-    PAUSED = 4
-    RESUMING = 5
-
-
-@dataclass
-class Registers:
-    """The general purpose registers."""
-
-    input_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
-    input_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
-    input_bit: list[bool] = field(default_factory=lambda: [False] * BIT_REGISTERS)
-    output_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
-    output_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
-    output_bit: list[bool] = field(default_factory=lambda: [False] * BIT_REGISTERS)
-
-
-@dataclass
-class Payload:
-    """What the arm carries: mass [kg], centre of gravity in the flange [m], inertia [kg m^2]."""
-
-    mass: float = 0.0
-    cog: tuple[float, ...] = (0.0, 0.0, 0.0)
-    inertia: tuple[float, ...] = (0.0,) * 6
-
-
-@dataclass
-class Outputs:
-    """What the control box puts out: digital lines (standard 0-7, configurable 8-15, tool 16-17) and two analog ones.
-
-    Analog values are shares of the range: 4-20 mA or, where the bit in `analog_types` is set, 0-10 V.
-    """
-
-    digital: int = 0
-    analog: list[float] = field(default_factory=lambda: [0.0, 0.0])
-    analog_types: int = 0
 
 
 @dataclass
@@ -127,6 +58,7 @@ class Controller:
 
     Args:
         q: (6,) joint angles [rad] at the start.
+        unlock_after_s: how long after a protective stop it can be left.
 
     Attributes:
         time: seconds since the controller started.
@@ -136,14 +68,16 @@ class Controller:
         slider: the speed slider, 0 to 1.
         loaded: the program file that the pendant has loaded.
         program: that runs, or is paused.
+        history: what was measured lately.
     """
 
-    def __init__(self, q: Array) -> None:
+    def __init__(self, q: Array, unlock_after_s: float = UNLOCK_AFTER_S) -> None:
         self.arm = Arm(q)
         self.registers = Registers()
         self.outputs = Outputs()
         self.payload = Payload()
         self.gravity: tuple[float, ...] = (0.0, 0.0, 9.82)
+        self._unlock_after_s = unlock_after_s
         self.time = 0.0
         self.execution_time = 0.0
         self.ticks = 0
@@ -168,9 +102,7 @@ class Controller:
         self._stopped_at = -math.inf
         self._force_limit_n = PROTECTIVE_FORCE_N
         self._targets = np.tile(self.arm.q, (64, 1))
-        # Measured joint angles and forces on the tool, newest last.
-        self.joint_history: deque[Array] = deque([self.arm.q], maxlen=_HISTORY_PERIODS)
-        self._force_history: deque[Array] = deque([np.zeros(3)], maxlen=_HISTORY_PERIODS)
+        self.history = History(self.arm.q)
 
     # What the arm does
 
@@ -219,26 +151,6 @@ class Controller:
     def speed_fraction(self) -> float:
         """What the speed slider stands at."""
         return self.slider if self.frozen_slider is None else self.frozen_slider
-
-    def contact_steps(self, direction: Sequence[float]) -> int:
-        """How many periods ago the tool came into contact; 0 when it is free. tool_contact.
-
-        Args:
-            direction: (at least 3) base axes, against which a contact pushes; zeros for any.
-        """
-        axis = np.array(direction[:3], dtype=np.float64)
-        length = float(np.linalg.norm(axis))
-        steps = 0
-        for force in reversed(self._force_history):
-            size = -float(force @ axis) / length if length > 0 else float(np.linalg.norm(force))
-            if size < _CONTACT_FORCE_N:
-                break
-            steps += 1
-        return steps
-
-    def joints_before(self, steps: int) -> Array:
-        """Joint angles (6,) measured some periods ago. get_actual_joint_positions_history."""
-        return self.joint_history[max(-1 - max(steps, 0), -len(self.joint_history))]
 
     # What the program is told
 
@@ -343,10 +255,10 @@ class Controller:
         self.note("Protective stop", reason)
 
     def unlock_protective_stop(self) -> bool:
-        """Leave a protective stop; False before `UNLOCK_AFTER_S`. The program stays paused."""
+        """Leave a protective stop; False before it can be left. The program stays paused."""
         if self.safety_mode is not SafetyMode.PROTECTIVE_STOP:
             return True
-        if self.time - self._stopped_at < UNLOCK_AFTER_S:
+        if self.time - self._stopped_at < self._unlock_after_s:
             return False
         self.safety_mode = SafetyMode.NORMAL
         # Somebody may have moved the arm meanwhile.
@@ -385,8 +297,7 @@ class Controller:
     def _measure(self, cell: np.void) -> None:
         self.arm.measure(cell["q"], cell["qd"], cell["wrench"])
         self._force_n = math.hypot(*cell["robot_force"].tolist())
-        self.joint_history.append(self.arm.measured_q)
-        self._force_history.append(self.arm.tcp_wrench[:3])
+        self.history.add(self.arm.measured_q, self.arm.tcp_wrench[:3])
 
     def _switch_power(self) -> None:
         if self._power_at is not None and self.time >= self._power_at:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sim_twin.wire.ur.controller import MODEL, SERIAL_NUMBER, VERSION, RobotMode, RuntimeState, SafetyMode
+from sim_twin.wire.ur.controller import MODEL, SERIAL_NUMBER, VERSION
+from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 
 if TYPE_CHECKING:
     from collections.abc import Callable

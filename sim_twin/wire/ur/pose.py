@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, TypeAlias
 
-from robotcell.geometry.transforms import Array, make_transform, rotvec_to_matrix
+from robotcell.geometry.transforms import make_transform, rotvec_to_matrix
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from robotcell.interfaces import Array
 
 Pose: TypeAlias = tuple[float, float, float, float, float, float]
 
@@ -49,3 +51,11 @@ def rotation_vector(R: Array) -> tuple[float, float, float]:
         return 0.0, 0.0, 0.0
     scale = 2 * math.atan2(sine, w) / sine
     return x * scale, y * scale, z * scale
+
+
+def displaced(T: Array, displacement: Array) -> Array:
+    """A transform (4, 4) after a displacement (6,) [m, rad] in base axes: the origin moves, the axes turn about it."""
+    moved: Array = T.copy()
+    moved[:3, 3] += displacement[:3]
+    moved[:3, :3] = rotvec_to_matrix(displacement[3:]) @ T[:3, :3]
+    return moved

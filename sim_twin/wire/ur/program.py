@@ -5,8 +5,25 @@ from __future__ import annotations
 from collections.abc import Generator
 from typing import TypeAlias
 
-# Yields once per control period.
+# Yields once per control period. A motion is a thread that commands one joint target before each yield.
 Thread: TypeAlias = Generator[None, None, None]
+
+_LARGEST = 1e6
+
+
+class ScriptError(Exception):
+    """A program does what the controller refuses; it dies with this message."""
+
+
+def checked(number: float) -> float:
+    """A number that a program may use.
+
+    Raises:
+        ScriptError: it is none, or so large that no robot has a use for it.
+    """
+    if not abs(number) <= _LARGEST:
+        raise ScriptError(f"{number} is no number that the controller can use")
+    return number
 
 
 class Program:

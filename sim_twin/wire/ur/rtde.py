@@ -10,9 +10,9 @@ import math
 import struct
 from typing import TYPE_CHECKING
 
+from sim_twin.wire.shared_state import PERIOD_S
 from sim_twin.wire.ur.controller import VERSION
 from sim_twin.wire.ur.inputs import write_inputs
-from sim_twin.wire.ur.motion import PERIOD_S
 from sim_twin.wire.ur.variables import INPUTS, OUTPUTS, Recipe, split_names
 
 if TYPE_CHECKING:

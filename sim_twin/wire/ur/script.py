@@ -12,7 +12,8 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
-from sim_twin.wire.ur.motion import Move, ScriptError, checked
+from sim_twin.wire.ur.moves import Move
+from sim_twin.wire.ur.program import ScriptError, checked
 
 if TYPE_CHECKING:
     from collections.abc import Callable

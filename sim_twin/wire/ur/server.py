@@ -20,13 +20,12 @@ import numpy as np
 
 from robotcell.errors import ConfigError
 from sim_twin.wire.faults import FaultInbox, Kind
-from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, Record
+from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, PERIOD_S, Record
 from sim_twin.wire.ur.control_loop import ControlLoop
 from sim_twin.wire.ur.controller import Controller
 from sim_twin.wire.ur.dashboard import GREETING, DashboardSession
-from sim_twin.wire.ur.motion import PERIOD_S, ScriptError
 from sim_twin.wire.ur.ports import Client, Port, Session
-from sim_twin.wire.ur.program import Program
+from sim_twin.wire.ur.program import Program, ScriptError
 from sim_twin.wire.ur.rtde import ProtocolError, RtdeSession
 from sim_twin.wire.ur.script import Script, ScriptReader
 from sim_twin.wire.ur.snapshot import Snapshot

@@ -10,8 +10,7 @@ import math
 from typing import TYPE_CHECKING
 
 from robotcell.geometry import ur5e
-from sim_twin.wire.ur.controller import RobotMode, RuntimeState, SafetyMode
-from sim_twin.wire.ur.motion import tcp_pose
+from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.variables import OUTPUTS, REGISTERS, SINGLE_BITS, Value
 
 if TYPE_CHECKING:
@@ -160,10 +159,10 @@ _SOURCES: dict[str, Callable[[Controller], Value]] = {
     "target_qdd": lambda c: c.arm.qdd.tolist(),
     "actual_q": lambda c: c.arm.measured_q.tolist(),
     "actual_qd": lambda c: c.arm.measured_qd.tolist(),
-    "actual_TCP_pose": lambda c: tcp_pose(c.arm, c.arm.measured_q),
+    "actual_TCP_pose": lambda c: c.arm.tcp_pose(c.arm.measured_q),
     "actual_TCP_speed": lambda c: _tcp_speed(c, c.arm.measured_q, c.arm.measured_qd),
     "actual_TCP_force": lambda c: c.arm.tcp_wrench.tolist(),
-    "target_TCP_pose": lambda c: tcp_pose(c.arm, c.arm.q),
+    "target_TCP_pose": lambda c: c.arm.tcp_pose(c.arm.q),
     "target_TCP_speed": lambda c: _tcp_speed(c, c.arm.q, c.arm.qd),
     "tcp_offset": lambda c: c.arm.tcp,
     "robot_mode": lambda c: int(c.robot_mode),

@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sim_twin.wire.faults import Kind
-from sim_twin.wire.ur.controller import Payload, RobotMode, SafetyMode
+from sim_twin.wire.ur.modes import RobotMode, SafetyMode
 from sim_twin.wire.ur.pose import ZERO_POSE
+from sim_twin.wire.ur.registers import Payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable

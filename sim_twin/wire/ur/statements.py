@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from sim_twin.wire.ur import motion as ur_motion
-from sim_twin.wire.ur.controller import Payload
-from sim_twin.wire.ur.motion import PERIOD_S, Motion, ScriptError
+from sim_twin.wire.shared_state import PERIOD_S
+from sim_twin.wire.ur.moves import follow
+from sim_twin.wire.ur.program import ScriptError
+from sim_twin.wire.ur.registers import Payload
 from sim_twin.wire.ur.script import PoseValue, Statement, Value, argument, move_of, number_of, numbers_of
+from sim_twin.wire.ur.speed_servo import servo_joints, speed_joints, speed_line
+from sim_twin.wire.ur.stops import stop_joints, stop_line
 from sim_twin.wire.ur.variables import BIT_REGISTERS, REGISTERS
 
 if TYPE_CHECKING:
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
     from sim_twin.wire.ur.controller import Controller
     from sim_twin.wire.ur.program import Thread
 
-_Action: TypeAlias = "Callable[[Controller, Statement], Motion | None]"
+_Action: TypeAlias = "Callable[[Controller, Statement], Thread | None]"
 
 
 def run_statements(controller: Controller, statements: Sequence[Statement]) -> Thread:
@@ -34,7 +37,7 @@ def run_statements(controller: Controller, statements: Sequence[Statement]) -> T
             moves = [move_of(statement)]
             while waiting and waiting[0].name in _MOVES:
                 moves.append(move_of(waiting.pop(0)))
-            yield from ur_motion.follow(controller.arm, moves)
+            yield from follow(controller.arm, moves)
             continue
         if statement.name == "halt":
             return
@@ -59,40 +62,40 @@ def run_at_once(controller: Controller, statements: Sequence[Statement]) -> None
 _MOVES = frozenset({"movej", "movel", "movep"})
 
 
-def _stop_joints(controller: Controller, statement: Statement) -> Motion:
-    return ur_motion.stop_joints(controller.arm, number_of(statement, 0, "a", 2.0))
+def _stop_joints(controller: Controller, statement: Statement) -> Thread:
+    return stop_joints(controller.arm, number_of(statement, 0, "a", 2.0))
 
 
-def _stop_line(controller: Controller, statement: Statement) -> Motion:
-    return ur_motion.stop_line(controller.arm, number_of(statement, 0, "a", 20.0))
+def _stop_line(controller: Controller, statement: Statement) -> Thread:
+    return stop_line(controller.arm, number_of(statement, 0, "a", 20.0))
 
 
-def _speed_joints(controller: Controller, statement: Statement) -> Motion:
+def _speed_joints(controller: Controller, statement: Statement) -> Thread:
     speed = np.array(numbers_of(statement, 0, "qd", 6))
     acceleration, time = number_of(statement, 1, "a", 1.4), number_of(statement, 2, "t", 0.0)
-    return ur_motion.speed_joints(controller.arm, speed, acceleration, time)
+    return speed_joints(controller.arm, speed, acceleration, time)
 
 
-def _speed_line(controller: Controller, statement: Statement) -> Motion:
+def _speed_line(controller: Controller, statement: Statement) -> Thread:
     speed = np.array(numbers_of(statement, 0, "xd", 6))
     acceleration, time = number_of(statement, 1, "a", 1.2), number_of(statement, 2, "t", 0.0)
-    return ur_motion.speed_line(controller.arm, speed, acceleration, time)
+    return speed_line(controller.arm, speed, acceleration, time)
 
 
-def _servo_joints(controller: Controller, statement: Statement) -> Motion:
+def _servo_joints(controller: Controller, statement: Statement) -> Thread:
     q = np.array(numbers_of(statement, 0, "q", 6))
     time = number_of(statement, 3, "t", PERIOD_S)
     lookahead, gain = number_of(statement, 4, "lookahead_time", 0.1), number_of(statement, 5, "gain", 300.0)
-    return ur_motion.servo_joints(controller.arm, q, time, lookahead, gain)
+    return servo_joints(controller.arm, q, time, lookahead, gain)
 
 
-def _sleep(controller: Controller, statement: Statement) -> Motion:
+def _sleep(controller: Controller, statement: Statement) -> Thread:
     until = controller.time + number_of(statement, 0, "t")
     while controller.time < until:
         yield
 
 
-def _sync(_: Controller, __: Statement) -> Motion:
+def _sync(_: Controller, __: Statement) -> Thread:
     yield
 
 

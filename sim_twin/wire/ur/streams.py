@@ -10,7 +10,8 @@ import struct
 from typing import TYPE_CHECKING
 
 from robotcell.geometry import ur5e
-from sim_twin.wire.ur.controller import VERSION, RobotMode, RuntimeState, SafetyMode
+from sim_twin.wire.ur.controller import VERSION
+from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.snapshot import joint_mode
 
 if TYPE_CHECKING:

@@ -102,6 +102,7 @@ def _hold_still(cell):
 
     def push(dt):
         sleep(dt)
+        arm.kick()
         if not arm.moving:
             way = -0.05 if (arm.state().q > start).all() else 0.05
             arm.start_joints(arm.state().q + way, 0.5, 1.0)

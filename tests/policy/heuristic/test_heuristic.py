@@ -11,7 +11,9 @@ from policy.heuristic.policy import CLEAR_GRASP
 from robotcell.config import CameraMount, CellConfig, Workspace
 from robotcell.errors import ConfigError, NoTarget
 from robotcell.geometry import rg2
-from robotcell.jobs.policy_api import Observation, Primitive
+from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
+from robotcell.motion.grasp import Grasp, grasp_height
+from robotcell.motion.push import Push
 from robotcell.perception.colors import PALETTE
 from robotcell.perception.segmentation import segment
 from tests.robotcell.maps import heightmap
@@ -51,7 +53,8 @@ class Scene:
 
     def look(self, goal=None, barred=(), *, may_push=True):
         view = replace(heightmap(self.heights, self.workspace), color=self.colors)
-        return Observation(view, segment(view).labels, goal, barred, may_push)
+        task = PickAny() if goal is None else PickGoal(goal)
+        return Observation(view, segment(view).labels, task, barred, may_push)
 
 
 def packed_goal():
@@ -68,8 +71,8 @@ def test_what_may_not_be_grasped_is_pushed(policy):
     goal = scene.box(MIDDLE)
     scene.box((MIDDLE[0] + 0.05, MIDDLE[1]), color="blue")
     observation = scene.look(goal)
-    assert policy.decide(observation).primitive is Primitive.GRASP
-    assert policy.decide(replace(observation, may_grasp=False)).primitive is Primitive.PUSH
+    assert isinstance(policy.decide(observation), Grasp)
+    assert isinstance(policy.decide(replace(observation, task=Uncover(goal))), Push)
 
 
 def finger_cells(scene, action):
@@ -77,7 +80,7 @@ def finger_cells(scene, action):
     reach = (CONFIG.gripper.preshape_m + rg2.FINGER_THICKNESS_M) / 2
     under = np.zeros(scene.heights.shape, bool)
     for side in (reach, -reach):
-        center = (action.xyz[0] + side * math.cos(action.theta), action.xyz[1] + side * math.sin(action.theta))
+        center = (action.x + side * math.cos(action.theta), action.y + side * math.sin(action.theta))
         under |= scene.footprint(center, (rg2.FINGER_THICKNESS_M, rg2.FINGER_BREADTH_M), action.theta)
     return under
 
@@ -93,13 +96,12 @@ def test_a_lone_cube_is_grasped_square_and_in_the_middle(x, y, angle, height):
     scene = Scene()
     scene.box((x, y), height=height, angle=angle)
     action = make_policy("heuristic", CONFIG).decide(scene.look())
-    assert action.primitive is Primitive.GRASP
+    assert isinstance(action, Grasp)
     assert CLEAR_GRASP <= action.q_value <= 1
-    assert math.hypot(action.xyz[0] - x, action.xyz[1] - y) < 0.012
+    assert math.hypot(action.x - x, action.y - y) < 0.012
     askew = (action.theta - angle + math.pi / 4) % (math.pi / 2) - math.pi / 4
     assert abs(askew) <= math.pi / 16 + 0.09  # half a step of 22.5 degrees, and what the cells blur
-    assert action.xyz[2] == pytest.approx(height, abs=1e-3)
-    assert Workspace().cell(*action.xyz[:2]) == (action.row, action.col)
+    assert action.surface_m == pytest.approx(height, abs=1e-3)
 
 
 @pytest.mark.parametrize("resolution_m", [0.001, 0.004, 0.007])
@@ -109,8 +111,8 @@ def test_cells_of_any_size_will_do(resolution_m):
     goal = scene.box((-0.52, 0.02), angle=0.4)
     scene.box((-0.45, -0.04), angle=0.1, color="blue")
     action = make_policy("heuristic", CellConfig(workspace=workspace)).decide(scene.look(goal))
-    assert action.primitive is Primitive.GRASP
-    assert math.hypot(action.xyz[0] + 0.52, action.xyz[1] - 0.02) < 0.015
+    assert isinstance(action, Grasp)
+    assert math.hypot(action.x + 0.52, action.y - 0.02) < 0.015
 
 
 @given(angle=st.floats(0, math.pi))
@@ -120,7 +122,7 @@ def test_a_plank_is_grasped_across(angle):
     scene.box(MIDDLE, size=(0.1, 0.04), height=0.025, angle=angle)
     action = make_policy("heuristic", CONFIG).decide(scene.look())
     across = abs(math.sin(action.theta - angle))
-    assert action.primitive is Primitive.GRASP
+    assert isinstance(action, Grasp)
     assert across > math.cos(math.radians(20))
 
 
@@ -140,20 +142,17 @@ def test_fingers_only_come_down_where_nothing_stands(seed, count):
         action = make_policy("heuristic", CONFIG).decide(scene.look(may_push=False))
     except NoTarget:
         return
-    tips = max(action.xyz[2] - 0.04, CONFIG.gripper.tip_clearance_m) + rg2.tip_retraction(CONFIG.gripper.preshape_m)
+    tips = grasp_height(action.surface_m, CONFIG) + rg2.tip_retraction(CONFIG.gripper.preshape_m)
     assert scene.heights[finger_cells(scene, action)].max(initial=0) < tips
 
 
 def test_a_packed_goal_is_pushed_free(policy):
     scene, goal = packed_goal()
     action = policy.decide(scene.look(goal))
-    assert action.primitive is Primitive.PUSH
-    assert scene.heights[action.row, action.col] == 0
-    assert action.xyz[2] == pytest.approx(0.05, abs=0.005)
-    way = [
-        (action.xyz[0] + s * math.cos(action.theta), action.xyz[1] + s * math.sin(action.theta))
-        for s in np.linspace(0, CONFIG.motion.push_m, 50)
-    ]
+    assert isinstance(action, Push)
+    assert scene.heights[Workspace().cell(*action.start)] == 0
+    assert action.top_m == pytest.approx(0.05, abs=0.005)
+    way = np.linspace(action.start, action.end, 50)
     assert any(scene.heights[Workspace().cell(x, y)] > 0 for x, y in way)
 
 
@@ -168,8 +167,8 @@ def test_only_the_goal_is_grasped(policy):
     scene.box((-0.58, 0.05), color="blue")
     goal = scene.box((-0.42, -0.06), color="red", height=0.03, angle=0.3)
     action = policy.decide(scene.look(goal))
-    assert action.primitive is Primitive.GRASP
-    assert goal[action.row, action.col]
+    assert isinstance(action, Grasp)
+    assert goal[Workspace().cell(action.x, action.y)]
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -182,10 +181,13 @@ def test_what_failed_is_not_repeated(policy, packed):
     for _ in range(4):
         action = policy.decide(scene.look(goal, barred))
         for old in barred:
-            near = math.dist(action.xyz[:2], old.xyz[:2]) < 0.02
-            period = 8 if action.primitive is Primitive.GRASP else 16
+            if type(action) is not type(old):
+                continue
+            grasps = isinstance(action, Grasp)
+            places = [(a.x, a.y) if grasps else a.start for a in (action, old)]
+            period = 8 if grasps else 16
             turn = (action.rotation - old.rotation) % period
-            assert not (action.primitive is old.primitive and near and min(turn, period - turn) <= 1)
+            assert not (math.dist(*places) < 0.02 and min(turn, period - turn) <= 1)
         barred = (*barred, action)
 
 

@@ -8,7 +8,9 @@ import pytest
 from policy.learned.policy import LearnedPolicy
 from robotcell.config import load_config
 from robotcell.errors import ConfigError, NoTarget
-from robotcell.jobs.policy_api import Observation, Primitive
+from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import Push
 from tests.robotcell.maps import heightmap
 
 CONFIG = load_config()
@@ -49,14 +51,14 @@ def observation():
     for label, place in enumerate((GOAL, OTHER), start=1):
         heights[place] = 0.05
         labels[place] = label
-    return Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+    return Observation(heightmap(heights), labels, PickGoal(labels == 1))
 
 
 @pytest.fixture
 def alone(observation):
     heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
     heights[GOAL], labels[GOAL] = 0.05, 1
-    return Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+    return Observation(heightmap(heights), labels, PickGoal(labels == 1))
 
 
 def decide(network, observation, **options):
@@ -67,27 +69,29 @@ def test_the_goal_selects_from_the_maps(network, observation):
     put(network.grasp, 4, 112, 138, 0.95)
     put(network.grasp, 5, 112, 113, 0.90)
     action = decide(network, observation)
-    assert (action.primitive, action.rotation, action.row, action.col) == (Primitive.GRASP, 5, 112, 113)
+    assert isinstance(action, Grasp)
+    assert (action.rotation, CONFIG.workspace.cell(action.x, action.y)) == (5, (112, 113))
     assert action.q_value == pytest.approx(0.90, abs=0.06)
-    assert action.xyz == pytest.approx((*CONFIG.workspace.position(112, 113), 0.05))
+    assert (action.x, action.y) == pytest.approx(CONFIG.workspace.position(112, 113))
+    assert action.surface_m == pytest.approx(0.05)
 
 
 def test_without_a_goal_the_best_object_is_taken(network, observation):
     put(network.grasp, 4, 112, 138, 0.95)
     put(network.grasp, 5, 112, 113, 0.90)
     put(network.grasp, 7, 10, 10, 2.0)  # the bare table
-    action = decide(network, replace(observation, goal=None))
-    assert (action.rotation, action.row, action.col) == (4, 112, 138)
+    action = decide(network, replace(observation, task=PickAny()))
+    assert (action.rotation, CONFIG.workspace.cell(action.x, action.y)) == (4, (112, 138))
 
 
 def test_a_doubtful_grasp_waits_for_a_push(network, observation):
     put(network.grasp, 5, 110, 115, 0.2)
     network.push[0, 105:120, 105:120] = 0.8
     action = decide(network, observation)
-    assert action.primitive is Primitive.PUSH
-    assert action.xyz[2] == pytest.approx(0.05)
-    assert decide(network, replace(observation, may_push=False)).primitive is Primitive.GRASP
-    assert decide(network, observation, may_push=False).primitive is Primitive.GRASP
+    assert isinstance(action, Push)
+    assert action.top_m == pytest.approx(0.05)
+    assert isinstance(decide(network, replace(observation, may_push=False)), Grasp)
+    assert isinstance(decide(network, observation, may_push=False), Grasp)
 
 
 def test_what_a_push_frees_counts_more_than_its_q(network, observation):
@@ -103,17 +107,19 @@ def test_among_pushes_that_free_alike_the_q_decides(network, alone):
     for k, value in ((0, 0.8), (4, 0.9)):
         network.push[k, 105:120, 105:120] = value
     action = decide(network, alone)
-    assert (action.primitive, action.rotation, action.q_value) == (Primitive.PUSH, 4, pytest.approx(0.9))
+    assert isinstance(action, Push)
+    assert (action.rotation, action.q_value) == (4, pytest.approx(0.9))
     # The fingers come down behind the block that the cell is on.
-    assert action.row < 100
-    assert 105 <= action.col < 120
+    row, col = CONFIG.workspace.cell(*action.start)
+    assert row < 100
+    assert 105 <= col < 120
 
 
 def test_what_would_be_lost_is_not_pushed(network, observation):
     # At the edge of the map, with no neighbour.
     heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
     heights[100:125, 190:215], labels[100:125, 190:215] = 0.05, 1
-    edge = Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+    edge = Observation(heightmap(heights), labels, PickGoal(labels == 1))
     network.grasp[0, 110, 200] = network.push[0, 110, 200] = 0.01
     network.push[0, 105:120, 195:210] = 0.9
     network.push[8, 105:120, 195:210] = 0.3
@@ -124,27 +130,28 @@ def test_what_would_be_lost_is_not_pushed(network, observation):
 def test_what_may_not_be_grasped_is_pushed(network, observation):
     put(network.grasp, 5, 110, 115, 0.95)
     network.push[0, 112, 112] = 0.1
-    assert decide(network, replace(observation, may_grasp=False)).primitive is Primitive.PUSH
+    hidden = replace(observation, task=Uncover(observation.labels == 1))
+    assert isinstance(decide(network, hidden), Push)
     with pytest.raises(NoTarget):
-        decide(network, replace(observation, may_grasp=False), may_push=False)
+        decide(network, hidden, may_push=False)
 
 
 def test_where_no_push_begins_near_the_goal_one_farther_out_is_taken(network):
     heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
     heights[35:190, 35:190], labels[35:190, 35:190] = 0.05, 2
     labels[GOAL] = 1
-    heap = Observation(heightmap(heights), labels, labels == 1, (), may_push=True)
+    heap = Observation(heightmap(heights), labels, PickGoal(labels == 1))
     put(network.grasp, 5, 110, 115, 0.02)
     network.push[0, 108:116, 55:63] = 0.9
     action = decide(network, heap)
-    assert action.primitive is Primitive.PUSH
-    assert not heights[action.row, action.col]
+    assert isinstance(action, Push)
+    assert not heights[CONFIG.workspace.cell(*action.start)]
 
 
 def test_a_likely_grasp_is_not_delayed(network, observation):
     put(network.grasp, 5, 110, 115, 0.9)
     network.push[0, 112, 112] = 1.0
-    assert decide(network, observation).primitive is Primitive.GRASP
+    assert isinstance(decide(network, observation), Grasp)
 
 
 def test_a_failed_action_is_not_repeated(network, observation):
@@ -167,7 +174,7 @@ def test_a_lone_peak_is_no_grasp(network, observation):
     network.grasp[4, 112, 105] = 1.0
     put(network.grasp, 4, 112, 118, 0.7)
     action = decide(network, replace(observation, may_push=False))
-    assert action.col == pytest.approx(118, abs=1)
+    assert CONFIG.workspace.cell(action.x, action.y)[1] == pytest.approx(118, abs=1)
 
 
 def test_a_failed_push_is_not_repeated(network, alone):
@@ -189,7 +196,7 @@ def test_broken_maps_are_an_error(network, observation, value):
 
 def test_an_empty_table_is_no_target(network, observation):
     with pytest.raises(NoTarget, match="no object"):
-        decide(network, replace(observation, labels=np.zeros_like(observation.labels), goal=None))
+        decide(network, replace(observation, labels=np.zeros_like(observation.labels), task=PickAny()))
 
 
 def test_grasps_that_failed_make_room_for_a_push(network, observation):
@@ -197,5 +204,5 @@ def test_grasps_that_failed_make_room_for_a_push(network, observation):
     put(network.grasp, 0, 120, 105, 0.85)
     network.push[0, 112, 112] = 0.7
     first = decide(network, observation)
-    assert first.primitive is Primitive.GRASP
-    assert decide(network, replace(observation, barred=(first,))).primitive is Primitive.PUSH
+    assert isinstance(first, Grasp)
+    assert isinstance(decide(network, replace(observation, barred=(first,))), Push)

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.errors import ConnectionLost, DeviceFault
 from robotcell.geometry import ur5e
-from robotcell.interfaces import ArmMode
+from robotcell.geometry.transforms import rotation_z
+from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode
 from sim_twin.devices.arm import PROTECTIVE_FORCE_N
 from sim_twin.world import robot_model
 from tests.sim_twin.cells import close_on, finish, go, joints_at, open_twin, tool_down, with_block
@@ -82,19 +83,60 @@ def test_a_motion_faster_than_the_motors_allow_ends_in_a_protective_stop(cell):
     assert cell.arm.state().mode is ArmMode.PROTECTIVE_STOP
 
 
-def test_a_straight_line_past_the_shoulder_is_refused(cell):
-    cell.arm.start_joints(joints_at(tool_down(-0.35, 0.15, 0.4)), 1.5, 1.4)
+@pytest.mark.parametrize(
+    ("start", "goal", "speed"),
+    [
+        pytest.param((-0.35, 0.15, 0.4), (0.35, -0.15, 0.4), 0.25, id="past the shoulder"),
+        pytest.param((-0.25, 0.15, 0.4), (-0.25, -0.25, 0.4), 3.0, id="faster than a joint turns"),
+        pytest.param((-0.5, 0.15, 0.4), (-2.0, 0.15, 0.4), 0.25, id="out of reach"),
+    ],
+)
+def test_a_line_that_the_arm_cannot_follow_ends_in_a_protective_stop_on_the_line(cell, start, goal, speed):
+    cell.arm.start_joints(joints_at(tool_down(*start)), 1.5, 1.4)
     finish(cell)
-    with pytest.raises(UnsafeMotion, match="straight motion refused"):
-        cell.arm.start_linear(tool_down(0.35, -0.15, 0.4), 0.25, 1.2)
-    assert not cell.arm.moving
+    cell.arm.start_linear(tool_down(*goal), speed, 50.0 if speed > 1 else 1.2)
+    finish(cell)
+    state = cell.arm.state()
+    assert state.mode is ArmMode.PROTECTIVE_STOP
+    # Somewhere on the way, and beside the line by no more than what a joint may lag behind.
+    way = np.subtract(goal, start)
+    length = np.linalg.norm(way)
+    done = state.T_base_tcp[:3, 3] - start
+    assert 0.01 < done @ way / length < 0.95 * length
+    assert np.linalg.norm(np.cross(done, way / length)) < 0.02
+    with pytest.raises(DeviceFault, match="recover"):
+        cell.arm.start_linear(tool_down(*start), 0.1, 1.2)
+    cell.arm.recover()
+    go(cell, tool_down(*start), speed=0.1)
+    np.testing.assert_allclose(cell.arm.state().T_base_tcp, tool_down(*start), atol=1e-3)
 
 
-def test_a_straight_line_that_a_joint_cannot_follow_is_refused(cell):
-    cell.arm.start_joints(joints_at(tool_down(-0.25, 0.15, 0.4)), 1.5, 1.4)
+def test_an_arm_that_cannot_take_the_first_step_of_a_line_stops_at_once(cell):
+    # The wrist is stretched: joint 5 stands at zero.
+    cell.arm.start_joints(cell.arm.state().q * np.array((1, 1, 1, 1, 0, 1)), 1.5, 1.4)
     finish(cell)
-    with pytest.raises(UnsafeMotion, match="go slower"):
-        cell.arm.start_linear(tool_down(-0.25, -0.25, 0.4), 3.0, 50.0)
+    aside = cell.arm.state().T_base_tcp.copy()
+    aside[:3, :3] = rotation_z(1.5) @ aside[:3, :3]
+    cell.arm.start_linear(aside, 1.0, 50.0)
+    finish(cell)
+    assert cell.arm.state().mode is ArmMode.PROTECTIVE_STOP
+
+
+def test_a_motion_that_is_kicked_no_longer_stops_on_its_path(cell):
+    start = cell.arm.state().q
+    cell.arm.start_joints(start + np.array((1.0, 0, 0, 0, 0, 0)), 0.5, 8.0)
+    for _ in range(50):
+        cell.arm.kick()
+        cell.clock.sleep(0.01)
+    silent_since = cell.clock.now()
+    while cell.arm.moving:
+        cell.clock.sleep(1 / 240)
+    # 0.5 rad/s is braked in 0.025 s.
+    assert KICK_TIMEOUT_S < cell.clock.now() - silent_since < KICK_TIMEOUT_S + 0.05
+    assert cell.arm.state().mode is ArmMode.READY
+    # It did not turn any further than at full speed until the end.
+    turned = cell.arm.state().q[0] - start[0]
+    assert 0.3 < turned < 0.37
 
 
 def test_a_held_block_weighs_on_the_flange():

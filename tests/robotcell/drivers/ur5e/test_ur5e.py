@@ -15,7 +15,7 @@ import pytest
 
 from robotcell.drivers.ur5e.dashboard import Dashboard
 from robotcell.drivers.ur5e.rtde import open_rtde
-from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.errors import ConnectionLost, DeviceFault
 from robotcell.geometry import rg2
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
@@ -107,14 +107,6 @@ def test_a_second_client_only_watches(arm: UR5e, caplog: pytest.LogCaptureFixtur
             start_descent(other)
     assert arm.state().mode is ArmMode.READY
     go_home(arm)
-
-
-def test_refuses_a_line_that_the_arm_cannot_follow(arm: UR5e) -> None:
-    through = arm.state().T_base_tcp.copy()
-    through[:3, 3] = (0.45, -0.3, 0.35)
-    with pytest.raises(UnsafeMotion, match="straight motion refused"):
-        arm.start_linear(through, 0.2, 1.0)
-    assert not arm.moving
 
 
 def test_stop_brakes_at_once(served: ServedCell, arm: UR5e) -> None:

@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_twin.wire.shared_state import CELL_STATE
+from sim_twin.wire.shared_state import CELL_STATE, PERIOD_S
 from sim_twin.wire.ur.control_loop import DONE, READY, ControlLoop
-from sim_twin.wire.ur.controller import Controller, RuntimeState
-from sim_twin.wire.ur.motion import PERIOD_S
+from sim_twin.wire.ur.controller import Controller
+from sim_twin.wire.ur.modes import RuntimeState
 from tests.sim_twin.wire.ur.stub_world import START_Q
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from robotcell.geometry.transforms import Array
-    from sim_twin.wire.ur.motion import Move
+    from sim_twin.wire.ur.moves import Move
 
 
-class Rig:
+class SteppedController:
     """Ticks a controller; `push` (6,) is the wrench on the tool, and `held` keeps the joints where they are."""
 
     def __init__(self) -> None:
@@ -55,8 +55,8 @@ class Rig:
         return "\n".join(f"{title}: {text}" for title, text in self.controller.notes)
 
 
-class LoopRig(Rig):
-    """A rig whose controller runs ur_rtde's control loop."""
+class SteppedControlLoop(SteppedController):
+    """A stepped whose controller runs ur_rtde's control loop."""
 
     def __init__(self, path: Sequence[Move] = (), offset: int = 0) -> None:
         super().__init__()

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, Record
-from sim_twin.wire.ur.motion import PERIOD_S
+from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, PERIOD_S, Record
 from sim_twin.wire.ur.server import serve_ur
 
 if TYPE_CHECKING:

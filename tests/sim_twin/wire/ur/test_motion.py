@@ -11,9 +11,14 @@ from hypothesis import strategies as st
 
 from robotcell.geometry import ur5e
 from robotcell.geometry.transforms import invert_transform, matrix_to_rotvec, rotvec_to_matrix
-from sim_twin.wire.ur import motion as ur_motion
-from sim_twin.wire.ur.motion import PERIOD_S, Arm, ForceMode, Motion, Move, ScriptError
+from sim_twin.wire.shared_state import PERIOD_S
+from sim_twin.wire.ur.arm import Arm
+from sim_twin.wire.ur.force_mode import ForceMode
+from sim_twin.wire.ur.moves import Move, follow
 from sim_twin.wire.ur.pose import matrix_to_pose, pose_to_matrix, rotation_vector
+from sim_twin.wire.ur.program import ScriptError, Thread
+from sim_twin.wire.ur.speed_servo import servo_circular, servo_joints, speed_joints, speed_line
+from sim_twin.wire.ur.stops import stop_joints, stop_line
 from tests.sim_twin.wire.ur.stub_world import START_Q
 
 if TYPE_CHECKING:
@@ -23,7 +28,7 @@ START = np.array(START_Q)
 TOOL = (0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
 
 
-def run(arm: Arm, motion: Motion, periods: int = 100_000) -> Array:
+def run(arm: Arm, motion: Thread, periods: int = 100_000) -> Array:
     """The targets of a motion; the joints follow at once."""
     targets = [arm.q]
     for _ in range(periods):
@@ -91,7 +96,7 @@ def test_the_pose_is_that_of_the_tcp() -> None:
 def test_joints_move_together_within_speed_and_acceleration() -> None:
     arm = Arm(START)
     goal = START + np.array([0.5, -0.2, 0.1, 0, 0, 0.3])
-    path = run(arm, ur_motion.follow(arm, [joints(goal)]))
+    path = run(arm, follow(arm, [joints(goal)]))
     np.testing.assert_array_equal(path[-1], goal)
     assert speeds(path).max() <= 1.0 + 1e-9
     assert np.abs(np.diff(path, n=2, axis=0)).max() / PERIOD_S**2 <= 2.0 + 1e-6
@@ -109,7 +114,7 @@ def test_a_straight_move_stays_on_its_line() -> None:
     goal = T.copy()
     goal[:3, 3] += [0.05, 0.1, -0.1]
     goal[:3, :3] = rotvec_to_matrix([0, 0, 0.4]) @ T[:3, :3]
-    path = run(arm, ur_motion.follow(arm, [line(goal)]))
+    path = run(arm, follow(arm, [line(goal)]))
     np.testing.assert_allclose(arm.forward(path[-1]), goal, atol=1e-9)
     poses = np.array([arm.forward(q) for q in path])
     way = poses[:, :3, 3] - T[:3, 3]
@@ -131,14 +136,14 @@ def test_a_blend_cuts_the_corner_within_its_radius(straight: bool) -> None:
         moves = [line(corner, blend=0.03), line(goal)]
     else:
         moves = [joints(arm.inverse(corner, START), blend=0.03), joints(arm.inverse(goal, START))]
-    places = np.array([arm.forward(q)[:3, 3] for q in run(arm, ur_motion.follow(arm, moves))])
+    places = np.array([arm.forward(q)[:3, 3] for q in run(arm, follow(arm, moves))])
     np.testing.assert_allclose(places[-1], goal[:3, 3], atol=1e-9)
     nearest = np.linalg.norm(places - corner[:3, 3], axis=1).min()
     assert 0.001 < nearest < 0.03
     # Without a blend the arm comes to a standstill in the corner itself.
     other = Arm(START)
     exact = [Move(m.target, m.is_pose, m.straight, m.speed, m.acceleration) for m in moves]
-    unblended = np.array([other.forward(q)[:3, 3] for q in run(other, ur_motion.follow(other, exact))])
+    unblended = np.array([other.forward(q)[:3, 3] for q in run(other, follow(other, exact))])
     assert np.linalg.norm(unblended - corner[:3, 3], axis=1).min() < 1e-9
     assert len(places) < len(unblended)
 
@@ -147,7 +152,7 @@ def test_the_numbers_of_the_way_points_are_told() -> None:
     arm = Arm(START)
     moves = [Move(tuple(START + 0.1 * i), False, False, 1.0, 5.0, 0.0, number=i) for i in (1, 2, 3)]
     told: list[int] = []
-    run(arm, ur_motion.follow(arm, moves, told.append))
+    run(arm, follow(arm, moves, told.append))
     assert told == [1, 2, 3]
 
 
@@ -156,7 +161,7 @@ def test_the_slider_slows_a_motion_on_the_same_path(rate: float) -> None:
     full, slow = Arm(START), Arm(START)
     slow.rate = rate
     move = joints(START + np.array([0.2, 0, 0, 0, 0, 0]))
-    path, slow_path = run(full, ur_motion.follow(full, [move])), run(slow, ur_motion.follow(slow, [move]))
+    path, slow_path = run(full, follow(full, [move])), run(slow, follow(slow, [move]))
     np.testing.assert_array_equal(slow_path[-1], path[-1])
     assert len(slow_path) - 1 == pytest.approx((len(path) - 1) / rate, abs=2 / rate)
     assert speeds(slow_path).max() <= rate * 1.0 + 1e-9
@@ -164,7 +169,7 @@ def test_the_slider_slows_a_motion_on_the_same_path(rate: float) -> None:
 
 def test_an_arm_that_is_left_in_motion_brakes() -> None:
     arm = Arm(START)
-    run(arm, ur_motion.follow(arm, [joints(START + 1.0, speed=1.5, acceleration=10)]), periods=200)
+    run(arm, follow(arm, [joints(START + 1.0, speed=1.5, acceleration=10)]), periods=200)
     speed = np.abs(arm.momentum).max()
     assert speed == pytest.approx(1.5)
     path = coast(arm)
@@ -175,8 +180,8 @@ def test_an_arm_that_is_left_in_motion_brakes() -> None:
 
 def test_stopj_brakes_as_it_is_told() -> None:
     arm = Arm(START)
-    run(arm, ur_motion.speed_joints(arm, np.array([1.0, 0, 0.5, 0, 0, 0]), 10.0, 0.5))
-    path = run(arm, ur_motion.stop_joints(arm, 4.0))
+    run(arm, speed_joints(arm, np.array([1.0, 0, 0.5, 0, 0, 0]), 10.0, 0.5))
+    path = run(arm, stop_joints(arm, 4.0))
     assert (len(path) - 1) * PERIOD_S == pytest.approx(1.0 / 4.0, abs=2 * PERIOD_S)
     way = path[-1] - path[0]
     np.testing.assert_allclose(way / way[0], [1, 0, 0.5, 0, 0, 0], atol=1e-6)
@@ -185,8 +190,8 @@ def test_stopj_brakes_as_it_is_told() -> None:
 
 def test_stopl_brakes_on_the_line() -> None:
     arm = Arm(START)
-    run(arm, ur_motion.speed_line(arm, np.array([0, 0.2, -0.1, 0, 0, 0]), 1.0, 0.5))
-    path = run(arm, ur_motion.stop_line(arm, 2.0))
+    run(arm, speed_line(arm, np.array([0, 0.2, -0.1, 0, 0, 0]), 1.0, 0.5))
+    path = run(arm, stop_line(arm, 2.0))
     places = np.array([arm.forward(q)[:3, 3] for q in path])
     way = places[-1] - places[0]
     assert np.linalg.norm(way) == pytest.approx((0.2**2 + 0.1**2) / 2 / 2.0, rel=0.02)
@@ -196,7 +201,7 @@ def test_stopl_brakes_on_the_line() -> None:
 
 def test_speedl_reaches_its_speed_at_its_acceleration() -> None:
     arm = Arm(START)
-    path = run(arm, ur_motion.speed_line(arm, np.array([0, 0, -0.1, 0, 0, 0.2]), 0.5, 0.6))
+    path = run(arm, speed_line(arm, np.array([0, 0, -0.1, 0, 0, 0.2]), 0.5, 0.6))
     assert len(path) - 1 == 300
     np.testing.assert_allclose(arm.twist(arm.q, arm.qd), [0, 0, -0.1, 0, 0, 0.2], atol=1e-3)
     heights = np.array([arm.forward(q)[2, 3] for q in path])
@@ -206,7 +211,7 @@ def test_speedl_reaches_its_speed_at_its_acceleration() -> None:
 def test_servoj_chases_its_target_without_overshoot() -> None:
     arm = Arm(START)
     goal = START + np.array([0.1, 0, 0, 0, 0, -0.1])
-    path = run(arm, ur_motion.servo_joints(arm, goal, 1.0, 0.1, 300))
+    path = run(arm, servo_joints(arm, goal, 1.0, 0.1, 300))
     assert np.abs(path[-1] - goal).max() < 1e-5
     assert path[:, 0].max() <= goal[0] + 1e-9
     assert speeds(path).max() <= ur5e.MAX_JOINT_SPEED
@@ -216,7 +221,7 @@ def test_servoc_comes_to_its_pose() -> None:
     arm = Arm(START)
     goal = arm.forward(START)
     goal[:3, 3] += [0, 0.05, 0.05]
-    path = run(arm, ur_motion.servo_circular(arm, matrix_to_pose(goal), 0.1, 0.5))
+    path = run(arm, servo_circular(arm, matrix_to_pose(goal), 0.1, 0.5))
     np.testing.assert_allclose(arm.forward(path[-1]), goal, atol=1e-6)
 
 
@@ -233,7 +238,7 @@ def test_servoc_comes_to_its_pose() -> None:
 def test_what_cannot_be_reached_kills_the_script_before_anything_moves(move: Move) -> None:
     arm = Arm(START)
     with pytest.raises(ScriptError):
-        run(arm, ur_motion.follow(arm, [move]))
+        run(arm, follow(arm, [move]))
     np.testing.assert_array_equal(arm.q, START)
 
 
@@ -244,15 +249,15 @@ def test_a_line_through_a_singularity_kills_the_script_on_the_way() -> None:
     goal = T.copy()
     goal[0, 3], goal[1, 3] = -T[0, 3], -T[1, 3]
     with pytest.raises(ScriptError, match=r"singularity|find a solution"):
-        run(arm, ur_motion.follow(arm, [line(goal, speed=1.0, acceleration=5.0)]))
+        run(arm, follow(arm, [line(goal, speed=1.0, acceleration=5.0)]))
     coast(arm)
     assert stands(arm)
 
 
 def test_two_motions_at_a_time_are_refused() -> None:
     arm = Arm(START)
-    one = ur_motion.speed_joints(arm, np.full(6, 0.1), 1.0, 1.0)
-    other = ur_motion.follow(arm, [joints(START + 0.1)])
+    one = speed_joints(arm, np.full(6, 0.1), 1.0, 1.0)
+    other = follow(arm, [joints(START + 0.1)])
     next(one)
     with pytest.raises(ScriptError, match="another thread"):
         next(other)
@@ -260,7 +265,7 @@ def test_two_motions_at_a_time_are_refused() -> None:
 
 def test_a_motion_cannot_go_on_where_the_arm_no_longer_is() -> None:
     arm = Arm(START)
-    motion = ur_motion.follow(arm, [joints(START + 0.5)])
+    motion = follow(arm, [joints(START + 0.5)])
     run(arm, motion, periods=100)
     arm.measure(START - 0.2, np.zeros(6), np.zeros(6))
     arm.hold()

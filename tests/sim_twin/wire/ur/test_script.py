@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_twin.wire.ur.motion import Move, ScriptError
+from sim_twin.wire.ur.moves import Move
+from sim_twin.wire.ur.program import ScriptError
 from sim_twin.wire.ur.script import PoseValue, Script, ScriptReader, parse_statement
 from tests.sim_twin.wire.ur.control_script import control_script
 
