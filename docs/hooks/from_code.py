@@ -43,14 +43,15 @@ def on_page_markdown(markdown: str, page: Page, **_: Any) -> str:
 
 
 def _settings(words: str, _page: str) -> str:
-    """Tables of a pydantic model, `MODULE:CLASS [PREFIX [LEVEL]]`, one for each of its own tables."""
-    name, prefix, level = [*words.split(), "", "3"][:3] if len(words.split()) < 3 else words.split()
+    """Tables of a pydantic model, `MODULE:CLASS PREFIX LEVEL` (prefix `-`: none), one for each table of the file."""
+    name, prefix, level = words.split()
     module, cls = name.split(":")
     model = getattr(import_module(module), cls)
-    return "\n".join(_model(model, "" if prefix == "-" else prefix, int(level)))
+    return "\n".join(_model(model, None, "" if prefix == "-" else prefix, int(level)))
 
 
-def _model(model: type[BaseModel], prefix: str, level: int) -> Iterator[str]:
+def _model(model: type[BaseModel], given: object, prefix: str, level: int) -> Iterator[str]:
+    """The tables of a model; `given` holds the defaults where they are not those of its class."""
     told = _descriptions(model)
     plain, tables = [], []
     for key, field in model.model_fields.items():
@@ -61,14 +62,16 @@ def _model(model: type[BaseModel], prefix: str, level: int) -> Iterator[str]:
         for key, field, _ in plain:
             if key not in told:
                 raise ValueError(f"{model.__name__}.{key} has no description: write a comment above it")
-            yield f"| `{prefix}{key}` | {_default(field)} | {_allowed(field)} | {told[key]} |"
+            default = _default(field) if given is None else f"`{_toml(getattr(given, key))}`"
+            yield f"| `{prefix}{key}` | {default} | {_allowed(field)} | {told[key]} |"
         yield ""
     for key, field, inner in tables:
         assert inner is not None
         many = get_origin(field.annotation) is tuple
         title = f"[[{prefix}{key}]]" if many else f"[{prefix}{key}]"
         yield from (f"{'#' * level} `{title}`", "", told.get(key) or _first_paragraph(inner), "")
-        yield from _model(inner, f"{prefix}{key}.", level)
+        different = field.default if isinstance(field.default, BaseModel) and field.default.model_fields_set else None
+        yield from _model(inner, different, f"{prefix}{key}.", level)
 
 
 def _descriptions(model: type[BaseModel]) -> dict[str, str]:
@@ -217,8 +220,8 @@ def _journal(_words: str, _page: str) -> str:
         lines += [f"### `{mapper.__tablename__}`", "", _first_paragraph(mapper), "", "| column | type | |", "|---|---|---|"]
         for column in mapper.__table__.columns:
             kind = f"{column.type}{'' if not column.nullable else ' or null'}".lower()
-            link = "".join(f"; of `{key.target_fullname}`" for key in column.foreign_keys)
-            lines.append(f"| `{column.name}` | {kind} | {told.get(column.name, '')}{link} |")
+            link = "".join(f" (`{key.target_fullname}`)" for key in column.foreign_keys)
+            lines.append(f"| `{column.name}` | {kind} | {told[column.name]}{link} |")
         lines.append("")
     return "\n".join(lines)
 
