@@ -5,29 +5,32 @@ The only figures that include everything: camera, arm, depth image and the calib
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from robotcell.errors import CalibrationError
+from robotcell.errors import CalibrationError, ConfigError
 from robotcell.geometry import rg2
 from robotcell.geometry.ur5e import inverse
-from robotcell.motion.executor import Ending, Executor
+from robotcell.motion.executor import Ending
 from robotcell.motion.path_check import check_path
-from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan, Step
+from robotcell.motion.plan import Grip, LinearMove, MotionPlan, Step, joint_move
 from robotcell.motion.retreat import plan_retreat
 from robotcell.motion.tool import flange_pose, tool_down
 from robotcell.perception.heightmap import Heightmap, TablePlane, build_heightmap
-from robotcell.perception.view import look
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.cell import Cell
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
 
+# The tips stand so high over a spot that is not touched: a gap that a rule or a gauge block measures.
+HOVER_M = 0.010
 # Their mean has a third of the depth noise.
 _FRAMES = 9
 # A spot is bare table when everything this far around it is seen and lies within this of the plane.
@@ -42,6 +45,7 @@ _TOUCH_SPEED_M_S = 0.010
 _TOUCH_ACCELERATION_M_S2 = 0.20
 _TOUCH_FORCE_N = 8.0
 _TOUCH_BELOW_M = 0.012
+_LIFT_SPEED_M_S = 0.040
 # What picking needs: the fingers go to within 3 mm of the table, and a block is 20 mm wide and more.
 MAX_HEIGHT_M = 0.003
 MAX_SPREAD_M = 0.003
@@ -109,6 +113,45 @@ class Verification:
         return found
 
 
+def verify(
+    cell: Cell,
+    count: int,
+    *,
+    touch: bool,
+    consent: Callable[[], bool],
+    hovering: Callable[[int, int, Array], None],
+) -> Verification:
+    """Look at the table from home, go to spots of it one after the other, and go home again.
+
+    Args:
+        cell: open, with nothing in its gripper.
+        count: how many spots; fewer where the bare table has no room for them.
+        touch: feel for the table at each spot instead of hovering over it.
+        consent: asked before the arm moves; nothing moves if it says no.
+        hovering: called while the tips stand `HOVER_M` over a spot, with its number from 1, the number of spots, and
+            the spot (3,) where the camera has it, base frame [m].
+
+    Raises:
+        ConfigError: consent was not given.
+        CalibrationError: the table is not where it should be, no spot of it is bare, or the arm does not meet it.
+        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as path check, guard and devices do.
+    """
+    if not consent():
+        raise ConfigError("nothing was moved")
+    go_home(cell)
+    table, spots = choose_spots(cell, count)
+    touches = []
+    for number, spot in enumerate(spots, 1):
+        if touch:
+            touches.append(touch_table(cell, spot))
+        else:
+            go_above(cell, spot, HOVER_M)
+            hovering(number, len(spots), spot)
+            touches.append(Touch(spot))
+    go_home(cell)
+    return Verification(table, tuple(touches))
+
+
 def choose_spots(cell: Cell, count: int) -> tuple[TablePlane, list[Array]]:
     """Look at the table from home, and choose bare spots of it, far from each other.
 
@@ -116,12 +159,12 @@ def choose_spots(cell: Cell, count: int) -> tuple[TablePlane, list[Array]]:
         The table's plane, and the places (3,) [m] of the spots in the base frame as the camera has them.
 
     Raises:
-        CalibrationError, DeviceFault: as `robotcell.jobs.job.look`; or no spot of the table is bare.
+        CalibrationError, DeviceFault: as `robotcell.perception.view.look`; or no spot of the table is bare.
     """
-    config = cell.config
-    table = look(cell).heightmap.table
+    config, view = cell.config, cell.look()
+    table = view.heightmap.table
     maps = [
-        build_heightmap(cell.camera.read(), config.camera.pose(), config.workspace, config.table.height_m)
+        build_heightmap(cell.camera.read(), view.camera, config.workspace, config.table.height_m)
         for _ in range(_FRAMES)
     ]
     stack = np.ma.masked_invalid(np.stack([m.closed_m for m in maps]))
@@ -148,7 +191,7 @@ def go_above(cell: Cell, spot: Array, height_m: float) -> None:
     """Close the fingers and stand over a spot, the tips so high above where the camera has it.
 
     Raises:
-        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as safety layer, guard and devices do.
+        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as path check, guard and devices do.
     """
     config, q = cell.config, cell.arm.state().q
     high, low = (_tool_at(spot, h) for h in (max(config.motion.approach_m, height_m), height_m))
@@ -157,10 +200,10 @@ def go_above(cell: Cell, spot: Array, height_m: float) -> None:
     steps: list[Step] = [
         Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
         LinearMove("up", T_up, config.motion.guarded_speed_m_s, config.motion.linear_acceleration_m_s2),
-        _joint("go above", high, config),
+        joint_move("go above", _solve(high, config), config),
         LinearMove("hover", low, config.motion.guarded_speed_m_s, config.motion.linear_acceleration_m_s2),
     ]
-    Executor(cell).run(check_path(MotionPlan("hover", q, tuple(steps)), config))
+    cell.executor.run(check_path(MotionPlan("hover", q, tuple(steps)), config))
 
 
 def touch_table(cell: Cell, spot: Array) -> Touch:
@@ -168,10 +211,10 @@ def touch_table(cell: Cell, spot: Array) -> Touch:
 
     Raises:
         CalibrationError: nothing is there.
-        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as safety layer, guard and devices do.
+        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as path check, guard and devices do.
     """
     go_above(cell, spot, _TOUCH_FROM_M)
-    deep = _deepened(cell)
+    lowest_tip_m = float(spot[2]) - _TOUCH_BELOW_M - cell.config.table.height_m
     down = LinearMove(
         "feel for the table",
         _tool_at(spot, -_TOUCH_BELOW_M),
@@ -179,11 +222,12 @@ def touch_table(cell: Cell, spot: Array) -> Touch:
         _TOUCH_ACCELERATION_M_S2,
         contact_force_n=_TOUCH_FORCE_N,
     )
-    plan = check_path(MotionPlan("touch", cell.arm.state().q, (down,)), deep.config)
-    execution = Executor(deep).run(plan)
+    plan = MotionPlan("touch", cell.arm.state().q, (down,))
+    execution = cell.executor.run(check_path(plan, cell.config, lowest_tip_m=lowest_tip_m))
     met = cell.arm.state().T_base_tcp[2, 3]
-    up = LinearMove("lift", _tool_at(spot, _TOUCH_FROM_M), _TOUCH_SPEED_M_S * 4, _TOUCH_ACCELERATION_M_S2)
-    Executor(deep).run(check_path(MotionPlan("lift", cell.arm.state().q, (up,)), deep.config))
+    up = LinearMove("lift", _tool_at(spot, _TOUCH_FROM_M), _LIFT_SPEED_M_S, _TOUCH_ACCELERATION_M_S2)
+    plan = MotionPlan("lift", cell.arm.state().q, (up,))
+    cell.executor.run(check_path(plan, cell.config, lowest_tip_m=lowest_tip_m))
     if execution.ending is not Ending.CONTACT:
         raise CalibrationError(
             f"the arm met nothing down to {1000 * _TOUCH_BELOW_M:.0f} mm below where the camera sees the table at "
@@ -196,9 +240,9 @@ def go_home(cell: Cell) -> None:
     """Straight up, open the fingers, home.
 
     Raises:
-        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as safety layer, guard and devices do.
+        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as path check, guard and devices do.
     """
-    Executor(cell).run(check_path(plan_retreat(cell.arm.state(), cell.config), cell.config))
+    cell.executor.run(check_path(plan_retreat(cell.arm.state(), cell.config), cell.config))
 
 
 def _bare(heights: npt.NDArray[np.floating], heightmap: Heightmap) -> npt.NDArray[np.bool_]:
@@ -216,17 +260,10 @@ def _tool_at(spot: Array, height_m: float) -> Array:
     return tool_down(float(spot[0]), float(spot[1]), float(spot[2]) + height_m, 0.0)
 
 
-def _joint(label: str, T_base_tcp: Array, config: CellConfig) -> JointMove:
+def _solve(T_base_tcp: Array, config: CellConfig) -> Array:
+    """Joint angles (6,) [rad] of a pose of the tool, nearest to home."""
     q = inverse(flange_pose(T_base_tcp), np.array(config.motion.home_q))
     if q is None:
         x, y, z = T_base_tcp[:3, 3]
         raise CalibrationError(f"the arm cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m, which the camera sees")
-    return JointMove(label, q, config.motion.joint_speed_rad_s, config.motion.joint_acceleration_rad_s2)
-
-
-def _deepened(cell: Cell) -> Cell:
-    """The same devices with limits that let the finger tips reach the table, and a little below."""
-    table = cell.config.table.model_copy(
-        update={"height_m": cell.config.table.height_m - _TOUCH_BELOW_M - cell.config.gripper.tip_clearance_m}
-    )
-    return replace(cell, config=cell.config.model_copy(update={"table": table}))
+    return q

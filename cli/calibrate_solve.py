@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from calibration.collect.session import read_session
-from calibration.solve.readers.records import read_file
-from calibration.solve.series import read_series
-from calibration.solve.solution import save_if_better
-from calibration.solve.solver import solve, solve_series
-from cli.console import progress, report_error, results
+from calibration.collect.session import read_views
+from calibration.solve.pipeline import solve, solve_series
+from calibration.solve.readers.pose_csv import read_series
+from calibration.solve.saving import save_if_better
+from cli.console import print_json, progress, report_error, results
 from robotcell.errors import CalibrationError, CellError, ConfigError
 from robotcell.geometry.transforms import matrix_to_rotvec
 
@@ -44,19 +41,24 @@ def run_solve(
     try:
         with progress().status("solving"):
             solution = _solve(source, _mount(mount), flange, board, refine_intrinsics)
-        if as_json:
-            sys.stdout.write(json.dumps(solution.as_json()) + "\n")
-        else:
-            print_solution(solution, results())
-        if out is not None and solution.accepted:
-            save_if_better(solution, out)
-            progress().print(Text(f"written: {out}"), soft_wrap=True)
-    except CalibrationError as kept:
-        report_error(kept)
-        return _REFUSED
     except CellError as error:
-        return report_error(error)
-    return 0 if solution.accepted else _REFUSED
+        return report_error(error, as_json=as_json)
+    if as_json:
+        print_json(solution.as_json())
+    else:
+        print_solution(solution, results())
+    if not solution.accepted:
+        return _REFUSED
+    if out is not None:
+        try:
+            save_if_better(solution, out)
+        except CalibrationError as kept:
+            report_error(kept)
+            return _REFUSED
+        except CellError as error:
+            return report_error(error)
+        progress().print(Text(f"written: {out}"), soft_wrap=True)
+    return 0
 
 
 def _mount(mount: str | None) -> Mount | None:
@@ -81,7 +83,7 @@ def _solve(
             raise ConfigError("--refine-intrinsics needs corners; these are poses of the board")
         return solve_series(read_series(flange), read_series(board), mount or "fixed")
     assert source is not None
-    views = read_session(source, mount) if source.is_dir() else read_file(source, mount)
+    views = read_views(source, mount)
     if refine_intrinsics and views.corners is None:
         raise ConfigError("--refine-intrinsics needs corners; these are poses of the board")
     return solve(views, refine_intrinsics=refine_intrinsics)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,65 +9,59 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from calibration.verify import Touch, Verification, choose_spots, go_above, go_home, touch_table
-from cli.console import progress, report_error, results
-from robotcell.cell import Cell, open_cell
-from robotcell.config import CellConfig, load_config
-from robotcell.errors import CalibrationError, CellError, ConfigError
+from calibration.verify import HOVER_M, Verification, verify
+from cli.console import print_json, progress, report_error, results
+from robotcell.cell import open_cell
+from robotcell.errors import CalibrationError, CellError
 from robotcell.motion.config_check import check_config
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from cli.options import CellChoice
+    from robotcell.config import CellConfig
+    from robotcell.geometry.transforms import Array
 
 _NOT_GOOD = 1
 _TWIN = "twin"
-_HOVER_M = 0.010
 
 
-def run_verify(cell_file: Path | None, points: int, *, touch: bool, yes: bool, as_json: bool) -> int:
+def run_verify(cell_choice: CellChoice, points: int, *, touch: bool, yes: bool, as_json: bool) -> int:
     """Run the command; returns the exit code."""
     try:
-        config = load_config(cell_file)
+        config = cell_choice.load()
         check_config(config)
         alone = yes or config.backend.name == _TWIN
         with open_cell(config) as cell:
-            verification = _verify(cell, points, touch=touch, alone=alone)
+            verification = verify(
+                cell,
+                points,
+                touch=touch,
+                consent=lambda: alone or _ask(points, touch=touch),
+                hovering=lambda number, count, spot: _stand_over(number, count, spot, wait=not alone),
+            )
     except CalibrationError as error:
-        report_error(error)
+        report_error(error, as_json=as_json)
         return _NOT_GOOD
     except CellError as error:
-        return report_error(error)
+        return report_error(error, as_json=as_json)
     problems = verification.problems(config)
     if as_json:
-        sys.stdout.write(json.dumps(_plain(verification, problems)) + "\n")
+        print_json(_plain(verification, problems))
     else:
         _print(verification, problems, config)
     return _NOT_GOOD if problems else 0
 
 
-def _verify(cell: Cell, points: int, *, touch: bool, alone: bool) -> Verification:
-    """Look, and go to each spot."""
-    if not alone:
-        deed = "feel for the table" if touch else "hover over the table"
-        if not typer.confirm(
-            f"The arm will {deed} at {points} bare spots. Is the cell clear, the gripper empty?", err=True
-        ):
-            raise ConfigError("nothing was moved")
-    go_home(cell)
-    table, spots = choose_spots(cell, points)
-    touches = []
-    for number, spot in enumerate(spots, 1):
-        if touch:
-            touches.append(touch_table(cell, spot))
-            continue
-        go_above(cell, spot, _HOVER_M)
-        touches.append(Touch(spot))
-        where = f"spot {number} of {len(spots)}, x {spot[0]:.3f}, y {spot[1]:.3f} m"
-        progress().print(Text(f"{where}: the tips stand {1000 * _HOVER_M:.0f} mm over the table"), soft_wrap=True)
-        if not alone:
-            typer.prompt("Measure the gap, then press Enter", default="", show_default=False, err=True)
-    go_home(cell)
-    return Verification(table, tuple(touches))
+def _ask(points: int, *, touch: bool) -> bool:
+    deed = "feel for the table" if touch else "hover over the table"
+    return typer.confirm(f"The arm will {deed} at {points} bare spots. Is the cell clear, the gripper empty?", err=True)
+
+
+def _stand_over(number: int, count: int, spot: Array, *, wait: bool) -> None:
+    """Say where the tips stand, and give the operator the time to measure the gap."""
+    where = f"spot {number} of {count}, x {spot[0]:.3f}, y {spot[1]:.3f} m"
+    progress().print(Text(f"{where}: the tips stand {1000 * HOVER_M:.0f} mm over the table"), soft_wrap=True)
+    if wait:
+        typer.prompt("Measure the gap, then press Enter", default="", show_default=False, err=True)
 
 
 def _plain(verification: Verification, problems: list[str]) -> dict[str, Any]:

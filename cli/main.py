@@ -43,7 +43,7 @@ def _version(value: bool) -> None:
 
 
 @app.callback()
-def robotcell(
+def main_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
@@ -267,12 +267,11 @@ def serve(
 
     Exit codes: 0 interrupted or terminated, 2 usage or configuration, 3 a server died.
     """
-    from cli.twin import run_serve
+    from cli.twin import Ports, run_serve
 
-    options = {"scene": scene, "meshes": meshes, "objects": objects, "seed": seed}
-    ports = {"modbus_port": modbus_port, "camera_port": camera_port, "control_port": control_port}
-    given = {key: value for key, value in options.items() if value is not None}
-    raise typer.Exit(run_serve(cell, given, host, ports, expose=expose))
+    options = {"--scene": scene, "--meshes": meshes, "--objects": objects, "--seed": seed}
+    ports = Ports(modbus_port, camera_port, control_port)
+    raise typer.Exit(run_serve(CellChoice(cell, settings, options), host, ports, expose=expose))
 
 
 @twin_app.command()
@@ -312,9 +311,8 @@ def record(
     """
     from cli.twin_record import run_record
 
-    options = {"scene": scene, "meshes": meshes, "objects": objects, "seed": seed}
-    given = {key: value for key, value in options.items() if value is not None}
-    raise typer.Exit(run_record(cell, given, out, seconds))
+    options = {"--scene": scene, "--meshes": meshes, "--objects": objects, "--seed": seed}
+    raise typer.Exit(run_record(CellChoice(cell, settings, options), out, seconds))
 
 
 def _end(number: int, _frame: FrameType | None) -> NoReturn:

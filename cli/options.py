@@ -78,15 +78,25 @@ class CellChoice:
         Raises:
             ConfigError: something is wrong in one of them, named as the user gave it.
         """
-        from robotcell.config import load_config, parse_setting
+        from robotcell.config import load_config
+
+        return load_config(self.file, *self.overrides())
+
+    def overrides(self) -> tuple[dict[str, object], dict[str, str]]:
+        """The values above the file, and how the user gave each, by dotted key.
+
+        Raises:
+            ConfigError: a value of --set is no KEY=VALUE.
+        """
+        from robotcell.config import parse_setting
 
         overrides: dict[str, object] = {}
         said_as: dict[str, str] = {}
         for text in self.settings or []:
             key, value = parse_setting(text)
-            overrides[key], said_as[key] = value, f"--set {key}"
+            overrides[key], said_as[key] = value, f"--set {key}="
         for option, value in self.options.items():
             if value is not None:
                 key = _KEYS[option]
-                overrides[key], said_as[key] = value, option
-        return load_config(self.file, overrides, said_as)
+                overrides[key], said_as[key] = value, f"{option} "
+        return overrides, said_as

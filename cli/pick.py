@@ -196,7 +196,6 @@ def _summary(report: Report | None, error: CellError | None, wall_s: float) -> d
 def _print_summary(summary: dict[str, Any], out: Console) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in summary.items():
-        # Not by `in {"", None}`: a list has no hash.
         if value is not None and value != "":
             shown = ", ".join(value) if isinstance(value, list) else str(value)
             table.add_row(Text(key.replace("_", " "), style="bold"), Text(shown, overflow="fold"))

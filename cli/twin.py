@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import json
 import signal
-import socket
 import time
-from contextlib import nullcontext
-from pathlib import Path
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 from rich.text import Text
 
 from cli.console import progress, report_error, results
-from robotcell.config import CellConfig, load_config
 from robotcell.errors import CellError, ConfigError, ConnectionLost
-from sim_twin.wire.cell import ServedCell, is_loopback
+from sim_twin.wire.cell import ServedCell
+from sim_twin.wire.control import ControlSocket
+from sim_twin.wire.control_client import ask
+from sim_twin.wire.exposure import check_exposure, is_loopback
+from sim_twin.wire.monitor import Pace, connected_clients, pace
+from sim_twin.wire.twin_config import load_as_twin
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from types import FrameType
+
+    from cli.options import CellChoice
 
 # What each endpoint is for.
 _USES = {
@@ -42,35 +46,40 @@ _SIGNAL_S = 0.05
 _TWICE_S = 1.0
 
 
-def run_serve(
-    cell_file: Path | None,
-    options: Mapping[str, Any],
-    host: str,
-    ports: Mapping[str, int | None],
-    *,
-    expose: bool,
-) -> int:
+@dataclass(frozen=True)
+class Ports:
+    """Where the parts of a served cell listen: ports of the Compute Box, the camera and the control socket.
+
+    0 stands for any; a control socket is there only when it has a port.
+    """
+
+    modbus: int
+    camera: int
+    control: int | None
+
+
+def run_serve(choice: CellChoice, host: str, ports: Ports, *, expose: bool) -> int:
     """Serve until SIGINT or SIGTERM; returns the exit code.
 
     Args:
-        cell_file: TOML file of the cell; its backend may be any, its arrangement is what counts.
-        options: of the twin, above those of the file.
+        choice: the cell; its backend may be any, its arrangement is what counts.
         host: address on which everything listens.
-        ports: `modbus_port`, `camera_port` and `control_port` of `ServedCell`.
+        ports: there.
         expose: `host` may be an address that others can reach.
     """
     try:
-        if not expose and not is_loopback(host):
-            raise ConfigError(
-                f"{host} can be reached from other machines, and the twin asks nobody who they are: take an address "
-                "such as 127.0.0.2, or say --expose"
-            )
-        config = as_twin(cell_file, options)
-        served = ServedCell(config, host, **{name: port for name, port in ports.items() if port is not None})
+        check_exposure(host, expose=expose)
+        config = load_as_twin(choice.file, *choice.overrides())
+        served = ServedCell(config, host, ports.modbus, ports.camera)
         ending = _Ending()
         with progress().status("building the cell and starting its servers"):
             served.start()
-        with served:
+        with ExitStack() as open_parts:
+            open_parts.enter_context(served)
+            endpoints = dict(served.endpoints)
+            if ports.control is not None:
+                control = open_parts.enter_context(ControlSocket(served, host, ports.control))
+                endpoints["control"] = control.endpoint
             if not is_loopback(host):
                 progress().print(
                     Text(
@@ -79,8 +88,8 @@ def run_serve(
                         style="bold red",
                     )
                 )
-            _print_endpoints(served.endpoints)
-            _watch(served, ending)
+            _print_endpoints(endpoints)
+            _watch(served, endpoints, ending)
     except CellError as error:
         return report_error(error)
     return 0
@@ -100,22 +109,15 @@ def run_fault(words: list[str], value: float | None, control: str, *, clear: boo
         if not (words or clear or show) or len(words) not in (0, 3, 4):
             raise ConfigError("say DEVICE CHANNEL KIND [WHAT] (gripper modbus stuck), or --clear, or --list")
         if clear:
-            _ask(control, {"clear": True})
+            ask(control, {"clear": True})
         if words:
             fault: dict[str, Any] = dict(zip(("device", "channel", "kind", "what"), words, strict=False))
-            _ask(control, {"inject": {**fault, "value": value}})
+            ask(control, {"inject": {**fault, "value": value}})
         if show:
-            _print_faults(_ask(control, {"list": True}))
+            _print_faults(ask(control, {"list": True}))
     except CellError as error:
         return report_error(error)
     return 0
-
-
-def as_twin(cell_file: Path | None, options: Mapping[str, Any]) -> CellConfig:
-    """The cell with the twin for its backend, whatever it was."""
-    backend = load_config(cell_file).backend
-    own = backend.options if backend.name == "twin" else {}
-    return load_config(cell_file, {"backend.name": "twin", "backend.options": {**own, **options}})
 
 
 class _Ending:
@@ -154,7 +156,7 @@ def _print_endpoints(endpoints: Mapping[str, str]) -> None:
     results().print(table)
 
 
-def _watch(served: ServedCell, ending: _Ending) -> None:
+def _watch(served: ServedCell, endpoints: Mapping[str, str], ending: _Ending) -> None:
     """Show how it goes, until it is to end or a server dies."""
     console = progress()
     before = None
@@ -166,52 +168,16 @@ def _watch(served: ServedCell, ending: _Ending) -> None:
             if line is not None:
                 now = served.state(), served.command()
                 if before is not None:
-                    line.update(_status(before, now, _clients(served.endpoints)))
+                    line.update(_status(pace(before, now), connected_clients(endpoints)))
                 before = now
 
 
-def _status(before: tuple[Any, Any], now: tuple[Any, Any], clients: Mapping[str, int]) -> str:
-    (state_before, command_before), (state, command) = before, now
-    seconds = max(float(state["wall"] - state_before["wall"]), 1e-9)
-    factor = float(state["t"] - state_before["t"]) / seconds
-    rate = float(command["tick"] - command_before["tick"]) / seconds
+def _status(kept: Pace, clients: Mapping[str, int]) -> str:
     connected = ", ".join(f"{count} {name}" for name, count in clients.items() if count) or "none"
-    left_out = int(state["skipped"])
-    return f"real time x {factor:.3f}, {left_out} steps left out; controller {rate:.0f} Hz; clients: {connected}"
-
-
-def _clients(endpoints: Mapping[str, str]) -> dict[str, int]:
-    """How many connections each endpoint has, where the system tells."""
-    try:
-        rows = [row.split() for row in Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]]
-    except OSError:
-        return {}
-    established = [row[1] for row in rows if row[3] == "01"]
-    counts = {}
-    for name, address in endpoints.items():
-        host, _, port = address.rpartition(":")
-        # The kernel writes the address in its own byte order, here that of a little-endian machine.
-        local = f"{socket.inet_aton(socket.gethostbyname(host))[::-1].hex().upper()}:{int(port):04X}"
-        counts[name] = established.count(local)
-    return counts
-
-
-def _ask(control: str, request: dict[str, Any]) -> dict[str, Any]:
-    host, _, port = control.rpartition(":")
-    if not host or not port.isdecimal():
-        raise ConfigError(f"--control {control!r}: give the address that `robotcell twin serve` prints, host:port")
-    try:
-        with socket.create_connection((host, int(port)), timeout=2) as link, link.makefile("rw") as lines:
-            lines.write(json.dumps(request) + "\n")
-            lines.flush()
-            answer: dict[str, Any] = json.loads(lines.readline())
-    except (OSError, ValueError) as error:
-        raise ConnectionLost(
-            f"no control socket answers at {control} ({error}): start `robotcell twin serve` with --control-port"
-        ) from error
-    if not answer["ok"]:
-        raise ConfigError(answer["error"])
-    return answer
+    return (
+        f"real time x {kept.real_time_factor:.3f}, {kept.skipped} steps left out; controller "
+        f"{kept.controller_hz:.0f} Hz; clients: {connected}"
+    )
 
 
 def _print_faults(answer: dict[str, Any]) -> None:

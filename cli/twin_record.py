@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cli.console import progress, report_error, results
-from cli.twin import as_twin
 from robotcell.errors import CellError
-from sim_twin.d415.renderer import FRAMES_PER_S
-from sim_twin.wire.d415.recorder import record
+from sim_twin.wire.d415.recorder import frames_in, record
+from sim_twin.wire.twin_config import load_as_twin
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
+    from cli.options import CellChoice
 
-def run_record(cell_file: Path | None, options: Mapping[str, Any], out: Path, seconds: float) -> int:
+
+def run_record(choice: CellChoice, out: Path, seconds: float) -> int:
     """Record; returns the exit code.
 
     Args:
-        cell_file: TOML file of the cell; its backend may be any, its arrangement is what counts.
-        options: of the twin, above those of the file.
+        choice: the cell; its backend may be any, its arrangement is what counts.
         out: the file to write.
         seconds: of frames.
     """
-    frames = max(1, round(seconds * FRAMES_PER_S))
+    frames = frames_in(seconds)
     try:
         with progress().status("building the cell") as status:
-            record(as_twin(cell_file, options), out, frames, lambda n: status.update(f"{n} of {frames} frames"))
+            config = load_as_twin(choice.file, *choice.overrides())
+            record(config, out, frames, lambda count: status.update(f"{count} of {frames} frames"))
     except CellError as error:
         return report_error(error)
     results().print(f"{out}: {frames} frames, {out.stat().st_size / 1e6:.0f} MB")

@@ -1,1 +1,1 @@
-"""Taking the views of a calibration."""
+"""Taking the views of a calibration: `acquisition` goes to planned poses, `session` keeps what was captured."""

@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 # A median of depth needs three; more make no corner better, since its error is that of the pixel grid.
 FRAMES = 3
 # An arm that holds its place shows joint speeds below the first (controllers tremble a little), and moves by less than
-# the second over the whole shot (0.1 mm at half a metre). It must have done so for the third.
+# the second over the whole capture (0.1 mm at half a metre). It must have done so for the third.
 _STILL_RAD_S = 0.03
 _STILL_RAD = 2e-4
 _STILL_S = 0.4
 _PERIOD_S = 0.05
 _PATIENCE_S = 5.0
-# Corners that wander by more than this between the frames of a shot [px] are of something that moves.
+# Corners that wander by more than this between the frames of a capture [px] are of something that moves.
 _WANDER_PX = 0.5
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One view as it was taken.
+class Capture:
+    """One view as it was captured.
 
     Attributes:
         t: time of its last frame on the cell's clock [s].
@@ -67,10 +67,10 @@ class Shot:
         return draw(self.color, self.detection)
 
 
-def take_shot(cell: Cell, detector: Detector) -> Shot:
+def capture_view(cell: Cell, detector: Detector) -> Capture:
     """Wait until the arm is at rest, and take one view.
 
-    A shot during which arm or board moved is refused as one without a board is: in its `detection`.
+    A capture during which arm or board moved is refused as one without a board is: in its `detection`.
 
     Raises:
         DeviceFault: the arm does not come to rest.
@@ -87,13 +87,13 @@ def take_shot(cell: Cell, detector: Detector) -> Shot:
     corners, wander_px = average([detection.corners for detection in seen])
     refused = detector.refuse(corners)
     if not refused and wander_px > _WANDER_PX:
-        refused = f"the corners moved by {wander_px:.1f} px during the shot: is the board, or the camera, loose?"
+        refused = f"the corners moved by {wander_px:.1f} px during the capture: is the board, or the camera, loose?"
     moved = float(np.ptp(q, axis=0).max())
     if moved > _STILL_RAD:
-        refused = f"a joint moved by {1000 * moved:.1f} mrad during the shot"
+        refused = f"a joint moved by {1000 * moved:.1f} mrad during the capture"
     depths = np.stack([frame.depth_m for frame in frames])
     depths[depths == 0] = np.nan
-    return Shot(
+    return Capture(
         t=frames[-1].t,
         color=np.rint(np.mean([frame.color for frame in frames], axis=0)).astype(np.uint8),
         depth_m=_median(depths),

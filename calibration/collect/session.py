@@ -4,30 +4,44 @@
     views/NAME.json     one view: joint angles, poses, corners; written last, so that a view is whole or not there
     views/NAME.png      its colour image
     views/NAME.depth.png  its depth image, 16 bit, in tenths of a millimetre, 0 = no return
+    refused/NUMBER.png  images that are of no use: not views, kept to be looked at
+    latest.png          the newest image, of use or not, with the corners that were found
 
 An interrupted collection keeps every view that was taken.
 """
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal
 
+import cv2
 import numpy as np
-from PIL import Image
 from pydantic import AwareDatetime, BaseModel, ConfigDict
 
-from calibration.solve.readers.records import CornerRecord, parse_board, read_json, validate, views_of_corners
+from calibration.solve.readers.corner_record import CornerRecord, parse_board, views_of_corners
+from calibration.solve.readers.json_file import read_json, validate
+from calibration.solve.readers.view_file import read_file
 from robotcell.config.calibration_file import CameraModel, CharucoBoard, Mount, PointBoard
 from robotcell.errors import ConfigError
-from robotcell.io.atomic_file import write_whole
+from robotcell.io.atomic_file import make_folder, write_whole
+from robotcell.io.images import write_image
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     import numpy.typing as npt
 
+    from calibration.collect.capture import Capture
     from calibration.solve.views import Views
+    from robotcell.geometry.transforms import Array
+    from robotcell.interfaces import RgbdFrame
 
+# Views that do not count lie here, below the folder of the session.
+REFUSED = "refused"
+# The newest image, with its corners drawn into it.
+LATEST = "latest.png"
 _HEADER = "session.json"
 _VIEWS = "views"
 _DEPTH_UNIT_M = 1e-4
@@ -69,19 +83,65 @@ class ViewRecord(CornerRecord):
     T_base_tcp: list[list[float]]
 
 
+def open_session(folder: Path, board: CharucoBoard, frame: RgbdFrame, *, resume: bool) -> SessionHeader:
+    """Start a session of a fixed camera, or go on with one.
+
+    Args:
+        folder: of the session.
+        board: that is in the gripper or on the flange.
+        frame: of the camera in use.
+        resume: there is a session already.
+
+    Raises:
+        ConfigError: there is a session already and should not be, or none and should be, or it is of another camera or
+            board.
+        StorageError: the folder cannot be written.
+    """
+    header = SessionHeader(
+        mount="fixed",
+        camera=camera_model(frame),
+        board=board,
+        started=datetime.now(timezone.utc),
+        software=f"robotcell {version('robotcell')}",
+    )
+    if not resume:
+        create_session(folder, header)
+        return header
+    before = load_header(folder)
+    for what in ("mount", "camera", "board"):
+        if getattr(before, what) != getattr(header, what):
+            raise ConfigError(
+                f"{folder}: its {what} is {getattr(before, what)!r} and {getattr(header, what)!r} is in use: start a "
+                "session of its own"
+            )
+    return before
+
+
+def camera_model(frame: RgbdFrame) -> CameraModel:
+    """The camera of a frame, whose images have no distortion."""
+    optics = frame.intrinsics
+    return CameraModel(
+        serial=frame.serial,
+        width=optics.width,
+        height=optics.height,
+        fx=optics.fx,
+        fy=optics.fy,
+        cx=optics.cx,
+        cy=optics.cy,
+    )
+
+
 def create_session(folder: Path, header: SessionHeader) -> None:
     """Start a session in a new or empty folder.
 
     Raises:
-        ConfigError: there is a session already, or the folder cannot be written.
+        ConfigError: there is a session already.
+        StorageError: the folder cannot be written.
     """
     if (folder / _HEADER).exists():
         raise ConfigError(f"{folder}: there is a session already; go on with --resume, or give another folder")
-    try:
-        (folder / _VIEWS).mkdir(parents=True, exist_ok=True)
-        write_whole(folder / _HEADER, header.model_dump_json(indent=1, exclude_none=True) + "\n")
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from error
+    make_folder(folder / _VIEWS)
+    write_whole(folder / _HEADER, header.model_dump_json(indent=1, exclude_none=True) + "\n")
 
 
 def add_view(
@@ -96,18 +156,47 @@ def add_view(
         depth_m: (H, W) [m], 0 = no return; None without a depth image.
 
     Raises:
-        ConfigError: the folder cannot be written.
+        StorageError: the folder cannot be written.
     """
     views = folder / _VIEWS
-    try:
-        # Packed lightly: the arm waits for it.
-        Image.fromarray(color).save(views / f"{view.name}.png", compress_level=1)
-        if depth_m is not None:
-            units = np.clip(np.rint(depth_m / _DEPTH_UNIT_M), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-            Image.fromarray(units).save(views / f"{view.name}.depth.png", compress_level=1)
-        write_whole(views / f"{view.name}.json", view.model_dump_json(indent=1, exclude_none=True) + "\n")
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from error
+    # Packed lightly: the arm waits for it.
+    write_image(views / f"{view.name}.png", color, compression=1)
+    if depth_m is not None:
+        units = np.clip(np.rint(depth_m / _DEPTH_UNIT_M), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+        write_image(views / f"{view.name}.depth.png", units, compression=1)
+    write_whole(views / f"{view.name}.json", view.model_dump_json(indent=1, exclude_none=True) + "\n")
+
+
+def add_capture(folder: Path, capture: Capture) -> Views:
+    """Add what was captured to a session: a view, or where it is of no use its image among the refused ones.
+
+    Returns:
+        The views that the session has now.
+
+    Raises:
+        ConfigError: something in the session is wrong.
+        StorageError: the folder cannot be written.
+    """
+    views = read_session(folder)
+    write_image(folder / LATEST, capture.picture())
+    if capture.detection.refused:
+        pictures = folder / REFUSED
+        write_image(pictures / f"{1 + len(list(pictures.glob('*.png'))):03d}.png", capture.color)
+        return views
+    number = 1 + max((int(name) for name in views.names if name.isdecimal()), default=0)
+    corners = capture.detection.corners
+    record = ViewRecord(
+        name=f"{number:03d}",
+        T_base_flange=capture.T_base_flange.tolist(),
+        ids=corners.ids.tolist(),
+        corners_px=[(float(u), float(v)) for u, v in corners.px],
+        depth_m=_depth_at(capture.depth_m, corners.px),
+        taken=datetime.now(timezone.utc),
+        q=tuple(capture.q.tolist()),
+        T_base_tcp=capture.T_base_tcp.tolist(),
+    )
+    add_view(folder, record, capture.color, capture.depth_m)
+    return read_session(folder)
 
 
 def load_header(folder: Path) -> SessionHeader:
@@ -158,3 +247,24 @@ def read_session(folder: Path, mount: Mount | None = None) -> Views:
     records = load_records(folder)
     date = max((record.taken for record in records), default=header.started)
     return views_of_corners(records, header.mount, header.camera, header.board, date, folder)
+
+
+def read_views(source: Path, mount: Mount | None = None) -> Views:
+    """The views of a session folder, or of another program's pairs.json or corners.json.
+
+    Args:
+        source: folder or file.
+        mount: where the camera is; must agree with what the source says.
+
+    Raises:
+        ConfigError: it cannot be read, or something in it is wrong.
+    """
+    return read_session(source, mount) if source.is_dir() else read_file(source, mount)
+
+
+def _depth_at(depth_m: npt.NDArray[np.float32], px: Array) -> list[float]:
+    """Mean depth around pixels (n, 2) [m]; 0 where most of them have no return."""
+    seen = (depth_m > 0).astype(np.float32)
+    total, count = (cv2.boxFilter(image, -1, (3, 3), normalize=False) for image in (depth_m, seen))
+    u, v = np.rint(px).astype(int).T
+    return [float(t / c) if c > 4 else 0.0 for t, c in zip(total[v, u], count[v, u], strict=True)]

@@ -1,1 +1,1 @@
-"""The report of a calibration."""
+"""The report of a calibration: `page` writes it."""

@@ -8,18 +8,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cv2
-import jinja2
 import numpy as np
 
-from calibration.collect.session import image_path
-from calibration.report import figures
-from robotcell.errors import ConfigError
+from calibration.collect.session import image_path, read_views
+from calibration.report import plots
+from calibration.report.reprojection import reprojection_residuals
+from calibration.report.scene import scene
+from calibration.solve.pipeline import solve
 from robotcell.geometry.transforms import matrix_to_rotvec
+from robotcell.io.html_page import write_html_page
 
 if TYPE_CHECKING:
+    from calibration.report.reprojection import Residual
     from calibration.solve.solution import Solution, ViewErrors
 
-_TEMPLATE = "report.html.j2"
+_TEMPLATE = Path(__file__).with_name("report.html.j2")
 _PICTURE_WIDTH_PX = 640
 _JPEG_QUALITY = 75
 
@@ -33,26 +36,31 @@ def write_report(solution: Solution, path: Path, session: Path | None = None) ->
         session: folder with the images of the views; None where there are none.
 
     Raises:
-        ConfigError: it cannot be written.
+        StorageError: it cannot be written.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(_TEMPLATE).render(_content(solution, session))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(page, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    write_html_page(path, _TEMPLATE, _content(solution, session))
+
+
+def rebuild_report(source: Path, path: Path) -> Solution:
+    """Solve recorded views again, and write the report of it.
+
+    Args:
+        source: folder of a session, or another program's pairs.json or corners.json.
+        path: of the HTML file.
+
+    Raises:
+        ConfigError: the source cannot be read, or something in it is wrong.
+        StorageError: the report cannot be written.
+    """
+    solution = solve(read_views(source))
+    write_report(solution, path, source if source.is_dir() else None)
+    return solution
 
 
 def _content(solution: Solution, session: Path | None) -> dict[str, Any]:
     views = solution.views
-    residuals = figures.residuals(solution)
+    residuals = reprojection_residuals(solution)
+    magnify = plots.magnification(residuals.values()) if residuals else 1.0
     units = (("mm", "millimetres"), ("deg", "degrees"), ("px", "pixels"))
     return {
         "date": f"{views.date:%Y-%m-%d %H:%M}",
@@ -62,16 +70,16 @@ def _content(solution: Solution, session: Path | None) -> dict[str, Any]:
         "words": solution.verdict.words,
         "cure": solution.verdict.cure,
         "result": _result(solution),
-        "scene": figures.scene(solution),
+        "scene": scene(solution),
         "spreads": [(name, spread) for unit, name in units if (spread := solution.spread(unit))],
-        "bars": figures.errors_by_view(solution),
+        "bars": plots.errors_by_view(solution),
         "facts": _facts(solution),
         "left_out": [error for error in solution.errors if not error.used],
-        "tilts": figures.directions(solution),
-        "distances": figures.distances(solution),
-        "coverage": figures.image_coverage(solution),
-        "magnify": figures.magnification(residuals.values()) if residuals else 1.0,
-        "pictures": _pictures(solution, session, residuals) if session else [],
+        "tilts": plots.directions(solution),
+        "distances": plots.distances(solution),
+        "coverage": plots.image_coverage(solution, residuals, magnify),
+        "magnify": magnify,
+        "pictures": _pictures(solution, session, residuals, magnify) if session else [],
     }
 
 
@@ -121,8 +129,9 @@ def _facts(solution: Solution) -> list[tuple[str, str]]:
     return facts
 
 
-def _pictures(solution: Solution, session: Path, residuals: dict[str, figures.Residual]) -> list[dict[str, Any]]:
-    magnify = figures.magnification(residuals.values()) if residuals else 1.0
+def _pictures(
+    solution: Solution, session: Path, residuals: dict[str, Residual], magnify: float
+) -> list[dict[str, Any]]:
     pictures = []
     for error in solution.errors:
         image = cv2.imread(str(image_path(session, error.name)))
@@ -132,7 +141,7 @@ def _pictures(solution: Solution, session: Path, residuals: dict[str, figures.Re
         size = (_PICTURE_WIDTH_PX, round(height * _PICTURE_WIDTH_PX / width))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-        drawn = figures.arrows(residuals[error.name], magnify, "arrow") if error.name in residuals else []
+        drawn = plots.arrows(residuals[error.name], magnify, "arrow") if error.name in residuals else []
         pictures.append(
             {
                 "name": error.name,

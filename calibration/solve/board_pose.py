@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from calibration.solve.projection import CornerStack, corner_weights, project
-from calibration.solve.rigid import change, skew
+from calibration.solve.projection import CornerStack, project
+from calibration.solve.robust_weights import corner_weights
+from calibration.solve.se3 import change, skew
 from robotcell.geometry.transforms import make_transform
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration.solve.rigid import invert, log, nearest_rotation, skew
+from calibration.solve.se3 import invert, log, nearest_rotation, skew
 from robotcell.geometry.transforms import Array, make_transform
 
 if TYPE_CHECKING:

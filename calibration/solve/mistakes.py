@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calibration.solve.consensus import Consensus, find_consensus
-from calibration.solve.rigid import difference, invert
+from calibration.solve.se3 import difference, invert
 from calibration.solve.verdict import Reason, Verdict, refuse
 
 if TYPE_CHECKING:

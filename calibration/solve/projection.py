@@ -1,4 +1,4 @@
-"""Points to pixels, with OpenCV's distortion, and the derivatives; and all views' corners as one padded stack."""
+"""Pinhole projection with OpenCV's distortion and its derivatives, and all views' corners as one padded stack."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 INTRINSICS = 9
 # Points behind the camera, which a bad start can produce, are projected as if they were this far in front [m].
 _NEAR = 1e-3
-# A corner further off than this many standard deviations is a false detection and pulls no harder (Huber 1964).
-HUBER_CORNER = 2.5
 
 
 @dataclass(frozen=True)
@@ -107,15 +105,3 @@ def project(points: Array, intrinsics: Array, *, derivatives: bool = True) -> tu
     by_intrinsics[..., 0, 6], by_intrinsics[..., 1, 6] = fx * 2 * x * y, fy * (r2 + 2 * y * y)
     by_intrinsics[..., 0, 7], by_intrinsics[..., 1, 7] = fx * (r2 + 2 * x * x), fy * 2 * x * y
     return px, by_point, by_intrinsics
-
-
-def corner_weights(residual_px: Array, seen: Array, sigma_px: float) -> Array:
-    """Huber weights (V, K) of corners, 0 for padding.
-
-    Args:
-        residual_px: (V, K, 2).
-        seen: (V, K).
-        sigma_px: standard deviation of a coordinate.
-    """
-    size = np.linalg.norm(residual_px, axis=-1) / sigma_px
-    return np.asarray(seen * np.minimum(1.0, HUBER_CORNER / np.maximum(size, 1e-12)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calibration.solve.rigid import log
+from calibration.solve.se3 import log
 
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
@@ -57,14 +57,14 @@ _CURES = {
     Reason.INVERTED_POSES: "Give T_camera_board (the board in the camera frame) and T_base_flange, not their inverses.",
     Reason.TRANSPOSED_POSES: "Write matrices row by row, with the position in the last column.",
     Reason.WRONG_MOUNT: "Give the right --mount; or, if it is right, give T_base_flange and not its inverse.",
-    Reason.SHIFTED_PAIRING: "Store image and arm pose as one record at the shot, and drop both where the board was not "
+    Reason.SHIFTED_PAIRING: "Store image and arm pose as one record per view, and drop both where the board was not "
     "found.",
     Reason.WRONG_UNITS: "Give every position in metres.",
     Reason.WRONG_SQUARE_SIZE: "Measure the squares of the printed board and give that size; print at 100 %. If they "
     "are right, the intrinsics are not: try --refine-intrinsics.",
     Reason.WRONG_INTRINSICS: "Give the intrinsics of this camera at this resolution, or let --refine-intrinsics find "
     "them.",
-    Reason.INCONSISTENT: "See that board and camera are bolted firmly, that the arm stands still at each shot, and "
+    Reason.INCONSISTENT: "See that board and camera are bolted firmly, that the arm stands still at each view, and "
     "that its poses are those of the flange; then take new views.",
     Reason.UNCERTAIN: "Take more views, spread over the workspace, with larger tilts and different distances.",
     Reason.CLOCKS: "Record both series over the same time, with the flange turning about changing axes.",

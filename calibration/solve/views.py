@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from calibration.solve.rigid import invert
+from calibration.solve.se3 import invert
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

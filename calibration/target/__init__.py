@@ -1,1 +1,1 @@
-"""The calibration board: its layout, how it is held, and how it is seen."""
+"""The calibration board: `board_page` prints it, `held_board` says how it is held, `detection` finds its corners."""

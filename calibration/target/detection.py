@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from calibration.solve.views import Corners
-from calibration.target.board import opencv_board
+from robotcell.perception.board_plate import opencv_board
 
 if TYPE_CHECKING:
     from robotcell.config.calibration_file import CharucoBoard

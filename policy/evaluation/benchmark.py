@@ -51,6 +51,7 @@ class Settings:
         meshes: folder of the OBJ files that they name.
         cell_file: where `cell` came from; None for the twin with its defaults.
         cell: the cell that the trials run in.
+        settings: what `--set` said above the cell's file.
     """
 
     suites: tuple[str, ...]
@@ -61,6 +62,7 @@ class Settings:
     meshes: str | None
     cell_file: str | None
     cell: CellConfig
+    settings: tuple[str, ...] = ()
 
     def command(self) -> str:
         """The command that runs the whole benchmark again."""
@@ -69,6 +71,8 @@ class Settings:
         for option, value in options.items():
             if value is not None:
                 words += [option, str(value)]
+        for setting in self.settings:
+            words += ["--set", setting]
         return shlex.join([*words, "--seed", str(self.seed)])
 
 
@@ -98,7 +102,7 @@ def plan(settings: Settings) -> list[Trial]:
     for name in settings.policies:
         make_policy(name, settings.cell)
     return [
-        Trial(name, case, settings.seed + t, policy, settings.cell, settings.cell_file)
+        Trial(name, case, settings.seed + t, policy, settings.cell, settings.cell_file, settings.settings)
         for name, suite in suites.items()
         for case in suite.cases
         for t in range(settings.trials or suite.trials)
@@ -140,7 +144,8 @@ def load(folder: Path) -> tuple[Settings, Origin]:
             raise ConfigError(f"{path}: version {head['version']}; this program continues version {FORMAT_VERSION}")
         values = head["settings"]
         values["cell"] = CellConfig.model_validate(values["cell"])
-        values["suites"], values["policies"] = tuple(values["suites"]), tuple(values["policies"])
+        for key in ("suites", "policies", "settings"):
+            values[key] = tuple(values.get(key, ()))
         return Settings(**values), Origin(head["started"], head["versions"])
     except (KeyError, TypeError, ValidationError) as error:
         raise ConfigError(f"{path}: not of a benchmark: {error}") from error

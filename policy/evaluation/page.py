@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import jinja2
-
 from policy.evaluation.benchmark import PICTURES, by_suite
 from policy.evaluation.metrics import BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED
 from policy.evaluation.report import Table, failures_table, results_table, scenes_table
 from policy.evaluation.suites import SUITES, describe_suite
 from robotcell.errors import ConfigError
+from robotcell.io.html_page import write_html_page
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
 
 # Pictures that a policy may show of each suite, which keeps the page below some ten megabytes; all are in the folder.
 _SHOWN = 12
+_TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 
 @dataclass(frozen=True)
@@ -51,27 +51,21 @@ def write_page(folder: Path, settings: Settings, origin: Origin, results: Sequen
     """Write `index.html` into a benchmark's folder; its path.
 
     Raises:
-        ConfigError: it cannot be written, or a picture of the folder is missing.
+        ConfigError: a picture of the folder is missing.
+        StorageError: it cannot be written.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    html = environment.get_template("page.html.j2").render(
-        settings=settings,
-        origin=origin,
-        sections=_sections(folder, settings, results),
-        resamples=BOOTSTRAP_RESAMPLES,
-        bootstrap_seed=BOOTSTRAP_SEED,
-    )
     path = folder / "index.html"
-    try:
-        path.write_text(html, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    write_html_page(
+        path,
+        _TEMPLATE,
+        {
+            "settings": settings,
+            "origin": origin,
+            "sections": _sections(folder, settings, results),
+            "resamples": BOOTSTRAP_RESAMPLES,
+            "bootstrap_seed": BOOTSTRAP_SEED,
+        },
+    )
     return path
 
 

@@ -57,6 +57,7 @@ class Trial:
         policy: who decides.
         config: the cell; scene, policy and journal of the trial stand above its own.
         cell_file: where that came from, for the command that runs the trial again.
+        settings: what `--set` said above it, likewise.
     """
 
     suite: str
@@ -65,6 +66,7 @@ class Trial:
     policy: str
     config: CellConfig
     cell_file: str | None = None
+    settings: tuple[str, ...] = ()
 
     @property
     def key(self) -> tuple[str, str, int, str]:
@@ -229,6 +231,8 @@ def _command(trial: Trial, scene_seed: int) -> str:
     words += ["--seed", str(scene_seed), "--policy", trial.policy]
     if trial.cell_file is not None:
         words += ["--cell", trial.cell_file]
+    for setting in trial.settings:
+        words += ["--set", setting]
     return shlex.join(words)
 
 

@@ -33,7 +33,7 @@ def load_config(
     Args:
         path: a TOML file; None for the twin with its defaults.
         overrides: values by dotted key (`backend.options.seed`) that stand above those of the file.
-        said_as: how the user gave an override (`--seed`), by dotted key, for the words of errors.
+        said_as: what the user wrote before an override's value (`--seed `), by dotted key, for the words of errors.
 
     Raises:
         ConfigError: naming every bad key at once, each with its value and what is allowed.
@@ -61,7 +61,8 @@ def load_config(
     if config is None or problems:
         place = str(path) if path else "the cell's settings"
         for key, words in (said_as or {}).items():
-            problems = [words + line.removeprefix(key) if line.startswith(f"{key} ") else line for line in problems]
+            start = f"{key} = "
+            problems = [words + line.removeprefix(start) if line.startswith(start) else line for line in problems]
         raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems]))
     return config
 

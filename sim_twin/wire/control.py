@@ -11,9 +11,14 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter, ValidationError
 
 from robotcell.errors import CellError, ConfigError
+from sim_twin.wire.exposure import is_loopback
 from sim_twin.wire.faults import Fault
 
 if TYPE_CHECKING:
+    from types import TracebackType
+
+    from typing_extensions import Self
+
     from sim_twin.wire.cell import ServedCell
 
 REQUESTS = (
@@ -58,16 +63,23 @@ def _obey(verb: str, argument: object, cell: ServedCell) -> dict[str, Any]:
     return {"state": {name: state[name].tolist() for name in state.dtype.names or ()}}
 
 
-class Control:
+class ControlSocket:
     """Listens for control lines in a thread of its own.
 
     Args:
         cell: that gets the faults.
-        host: a loopback address to listen at.
+        host: address of the cell; the socket listens there where only this machine reaches it, else at 127.0.0.1.
         port: there; 0 for any.
+
+    Attributes:
+        endpoint: "host:port" where it listens.
+
+    Raises:
+        ConfigError: it cannot listen there.
     """
 
     def __init__(self, cell: ServedCell, host: str, port: int) -> None:
+        host = host if is_loopback(host) else "127.0.0.1"
         self._cell = cell
         self._ended = threading.Event()
         try:
@@ -79,6 +91,14 @@ class Control:
         self.endpoint = f"{host}:{self._listener.getsockname()[1]}"
         self._thread = threading.Thread(target=self._run, name="robotcell twin control", daemon=True)
         self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def close(self) -> None:
         """Hang up and end. Idempotent."""

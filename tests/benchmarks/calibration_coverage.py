@@ -10,8 +10,8 @@ import sys
 import numpy as np
 from scipy.stats import chi2
 
-from calibration.solve.rigid import difference
-from calibration.solve.solver import solve
+from calibration.solve.pipeline import solve
+from calibration.solve.se3 import difference
 from tests.calibration.synthetic import as_poses, make_views
 
 # mount, views, corner noise [px], position [m] and rotation [rad] noise of the arm, poses instead of corners

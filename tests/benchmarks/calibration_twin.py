@@ -25,14 +25,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.collect.collection import collect, open_session
-from calibration.collect.planning import HeldBoard
-from calibration.collect.session import read_session
-from calibration.solve.rigid import change, difference
-from calibration.solve.solver import solve
-from calibration.target.board import DEFAULT_BOARD, held_by_gripper
+from calibration.collect.acquisition import collect
+from calibration.collect.session import open_session, read_session
+from calibration.solve.pipeline import solve
+from calibration.solve.se3 import change, difference
+from calibration.target.held_board import HeldBoard
 from robotcell.config import load_config
 from robotcell.errors import CellError
+from robotcell.perception.board_plate import DEFAULT_BOARD, held_by_gripper
 from sim_twin.devices.backend import open_twin
 from sim_twin.options import TwinOptions
 
@@ -67,10 +67,10 @@ class Trial:
 
 
 class _Silent:
-    def going(self, taken, count):
+    def moving(self, taken, count):
         pass
 
-    def took(self, shot, taken, count, estimate):
+    def captured(self, capture, taken, count, estimate):
         pass
 
     def skipped(self, why):

@@ -5,7 +5,7 @@ Targets on two cores: 20 views of a ChArUco board 2 s, 200 views 20 s.
 
 import pytest
 
-from calibration.solve.solver import solve
+from calibration.solve.pipeline import solve
 from tests.calibration.synthetic import make_views
 
 

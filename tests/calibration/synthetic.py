@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.solve.projection import intrinsics_vector, project
-from calibration.solve.rigid import change, exp, invert
+from calibration.solve.se3 import change, exp, invert
 from calibration.solve.views import Corners, Views
 from robotcell.config.calibration_file import CameraModel, CharucoBoard, Mount
 from robotcell.geometry.transforms import look_at, make_transform

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from calibration.solve.rigid import difference
+from calibration.solve.se3 import difference
 from cli.main import app
 from robotcell.config.calibration_file import load_calibration
-from tests.calibration.solve.readers.test_records import corners_file, write
-from tests.calibration.solve.test_series import recording
-from tests.calibration.solve.test_series import write as write_series
+from tests.calibration.solve.readers.test_view_file import corners_file, write
+from tests.calibration.solve.test_time_alignment import recording
+from tests.calibration.solve.test_time_alignment import write as write_series
 from tests.calibration.synthetic import as_poses, make_views, to_json
 
 MOVEIT = Path(__file__).parents[1] / "calibration" / "data" / "moveit_pose_samples.json"

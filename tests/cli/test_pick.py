@@ -137,7 +137,10 @@ def test_jobs_are_listed_and_shown(cell: Path) -> None:
         (("--goal", "mauve"), 2, "mauve"),
         ((), 2, "say either --goal"),
         (("--goal", "red", "--all"), 2, "say either --goal"),
-        (("--goal", "red", "--objects", "0"), 2, "backend.options.objects = 0"),
+        (("--goal", "red", "--objects", "0"), 2, "--objects 0: Input should be"),
+        (("--goal", "red", "--set", "limits.force_n=-1"), 2, "--set limits.force_n=-1: Input should be"),
+        (("--goal", "red", "--set", "limits.force=1"), 2, "--set limits.force=1: unknown key"),
+        (("--goal", "red", "--set", "limits"), 2, "say KEY=VALUE"),
         (("--goal", "red", "--policy", "oracle"), 2, "no policy is called 'oracle'"),
         (("--goal", "red", "--scene", "moon"), 2, "moon"),
         (("--goal", "green"), 1, "no green object"),
@@ -155,6 +158,7 @@ def test_what_was_done_before_a_refusal_is_in_the_json(cell: Path) -> None:
     summary = json.loads(result.stdout)
     assert summary["completed"] is False
     assert "no green object" in summary["reason"]
+    assert summary["code"] == "no-target"
     assert summary["picked_objects"] == ["red"]
     assert (Path(summary["run_dir"]) / "summary.gif").is_file()
 
@@ -166,13 +170,15 @@ def test_a_job_that_never_started_has_the_same_keys_in_json(cell: Path) -> None:
     assert refused["job"] is None
 
 
-def test_a_folder_that_cannot_be_made_is_a_wrong_setting(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text('[journal]\nruns = "/dev/null/runs"\n')
     for arguments in (("--dry-run",), ()):
         result = run("pick", "--goal", "red", "--cell", path, *arguments)
-        assert result.exit_code == 2, result.output
+        assert result.exit_code == 3, result.output
         assert "/dev/null/runs" in result.stderr
+    shown = json.loads(run("pick", "--goal", "red", "--cell", path, "--json").stdout)
+    assert (shown["code"], shown["device"]) == ("storage", None)
 
 
 def test_brackets_in_a_path_are_printed_as_they_are(tmp_path: Path) -> None:
@@ -193,3 +199,49 @@ def test_help_imports_nothing_heavy() -> None:
     )
     completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert completed.returncode == 0, completed.stderr
+
+
+def test_settings_of_the_command_line_stand_above_the_file_and_goals_are_read_in_any_case(
+    cell: Path, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    done = run(
+        "pick",
+        "--goal",
+        "RED",
+        "--cell",
+        cell,
+        "--set",
+        f'journal.runs="{elsewhere}"',
+        "--set",
+        "motion.approach_m=0.12",
+    )
+    assert done.exit_code == 0, done.output
+    assert (elsewhere / "journal.db").is_file()
+    assert "red" in run("jobs", "--set", f"journal.runs={elsewhere}").stdout
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert run("--version").stdout.startswith("robotcell 0.")
+
+
+def test_verbose_tells_where_an_error_comes_from(cell: Path) -> None:
+    completed = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from cli.main import main; main()",
+            "pick",
+            "--goal",
+            "mauve",
+            "--cell",
+            str(cell),
+            "-v",
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert completed.returncode == 2
+    assert "where it came from" in completed.stderr
+    assert "goal_color" in completed.stderr

@@ -142,4 +142,10 @@ def test_refuses_to_be_reached_by_others_unless_told():
 def test_a_wrong_scene_is_said_before_anything_starts():
     code, output = run("serve", "--host", "127.0.0.22", "--objects", 99)
     assert code == 2
-    assert "objects = 99" in output
+    assert "--objects = 99" in output
+
+
+def test_settings_of_the_cell_are_taken():
+    code, output = run("serve", "--host", "127.0.0.22", "--set", "table.height_m=nonsense")
+    assert code == 2
+    assert "--set table.height_m" in output

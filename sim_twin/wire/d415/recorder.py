@@ -30,6 +30,11 @@ if TYPE_CHECKING:
 SUFFIX = ".db3"
 
 
+def frames_in(seconds: float) -> int:
+    """How many frames a recording of so many seconds has; at least one."""
+    return max(1, round(seconds * FRAMES_PER_S))
+
+
 def record(config: CellConfig, path: Path, frames: int, tell: Callable[[int], None] = lambda _: None) -> None:
     """Write a recording of a twin whose arm stands at home.
 

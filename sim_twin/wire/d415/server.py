@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 WRONG_SERIAL = "999999999999"
 
-FAULTS: frozenset[tuple[str, Kind, str]] = IMAGE_FAULTS | {
+CAMERA_FAULTS: frozenset[tuple[str, Kind, str]] = IMAGE_FAULTS | {
     ("stream", Kind.OFF, ""),  # the port is closed
     ("stream", Kind.STUCK, ""),  # the same frame again and again
     ("stream", Kind.SLOW, ""),  # `value` times the usual rate, 0.2 unless given

@@ -18,10 +18,10 @@ from sim_twin.wire.rg2.modbus import ModbusServer, Refusal, RefusedError
 from sim_twin.wire.shared_state import CELL_STATE, GRIPPER_COMMAND, Record
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from multiprocessing.connection import Connection
 
-FAULTS: frozenset[tuple[str, Kind, str]] = frozenset(
+GRIPPER_FAULTS: frozenset[tuple[str, Kind, str]] = frozenset(
     [
         ("modbus", Kind.OFF, ""),
         ("modbus", Kind.STUCK, ""),
@@ -60,7 +60,7 @@ _IDENTITY = {
 }
 
 
-def serve_box(
+def serve_compute_box(
     host: str, port: int, gripper_command: str, cell_state: str, faults: Connection, ready: Connection
 ) -> None:
     """Serve until SIGTERM, or until the supervisor is gone.
@@ -88,9 +88,11 @@ class Rg2:
     Args:
         command: the record `GRIPPER_COMMAND`.
         state: the record `CELL_STATE`.
+        now: the time [s] by which a power cycle takes its time.
     """
 
-    def __init__(self, command: Record, state: Record) -> None:
+    def __init__(self, command: Record, state: Record, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
         self._command = command
         self._state = state
         self._targets = {_FORCE: 0, _WIDTH: 0}
@@ -112,7 +114,7 @@ class Rg2:
         self._unit = _WRONG_UNIT if inbox.find("modbus", Kind.WRONG, "unit") else _TOOL
         self._wrong = {
             what: fault.value
-            for channel, kind, what in FAULTS
+            for channel, kind, what in GRIPPER_FAULTS
             if channel == "state" and (fault := inbox.find(channel, kind, what)) and kind is Kind.WRONG
         }
         frozen = inbox.find("state", Kind.STUCK)
@@ -162,7 +164,7 @@ class Rg2:
         if writes[0] != _POWER_CYCLE:
             raise RefusedError(Refusal.VALUE)
         self._send(stop=True)
-        self._no_power_until = time.monotonic() + _POWER_CYCLE_S
+        self._no_power_until = self._now() + _POWER_CYCLE_S
         # A switch that is pushed while the power comes back shows as a safety error, and trips again.
         self._safety_error = bool(self._pushed)
         self._tripped = set(self._pushed)
@@ -183,7 +185,7 @@ class Rg2:
         self._command.write(count=self._count, stop=stop, width_m=width_m, force_n=force_n)
 
     def _powered(self) -> bool:
-        return time.monotonic() >= self._no_power_until
+        return self._now() >= self._no_power_until
 
     def _width(self) -> int:
         """Between the bare fingers [0.1 mm]."""

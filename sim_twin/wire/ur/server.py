@@ -36,7 +36,7 @@ from sim_twin.wire.ur.streams import STATE_PERIOD_S, note_message, realtime_pack
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
-FAULTS: frozenset[tuple[str, Kind, str]] = frozenset(
+ARM_FAULTS: frozenset[tuple[str, Kind, str]] = frozenset(
     {
         ("rtde", Kind.OFF, ""),
         ("rtde", Kind.STUCK, ""),
@@ -69,13 +69,20 @@ _BAD_LINE = b"\xff\x00\xfe\x81?\n"
 
 
 def serve_ur(
-    host: str, q: tuple[float, ...], arm_command: str, cell_state: str, faults: Connection, ready: Connection
+    host: str,
+    q: tuple[float, ...],
+    unlock_after_s: float,
+    arm_command: str,
+    cell_state: str,
+    faults: Connection,
+    ready: Connection,
 ) -> None:
     """Be the UR controller of a served cell until SIGTERM comes or the supervisor is gone.
 
     Args:
         host: address that the ports are opened on.
         q: (6,) joint angles [rad] at the start.
+        unlock_after_s: how long after a protective stop the arm can be unlocked.
         arm_command: name of the record that is written.
         cell_state: name of the record that is read.
         faults: from which the faults come.
@@ -85,7 +92,7 @@ def serve_ur(
     # The library of inverse kinematics writes warnings to standard output; who does not read them must not hold us up.
     with Path(os.devnull).open("wb") as nowhere:
         os.dup2(nowhere.fileno(), 1)
-    server = _Server(host, q, faults)
+    server = _Server(host, Controller(np.array(q), unlock_after_s), faults)
     signal.signal(signal.SIGTERM, lambda *_: server.stop())
     command, state = Record(ARM_COMMAND, arm_command), Record(CELL_STATE, cell_state)
     try:
@@ -130,9 +137,9 @@ class _ReadOnlySession:
 class _Server:
     """All ports of one controller."""
 
-    def __init__(self, host: str, q: tuple[float, ...], faults: Connection) -> None:
-        self._controller = Controller(np.array(q))
-        self._q = np.array(q)
+    def __init__(self, host: str, controller: Controller, faults: Connection) -> None:
+        self._controller = controller
+        self._q = controller.arm.q.copy()
         self._connection = faults
         self._inbox = FaultInbox(faults, "arm")
         self._state_faults = StateFaults(self._controller)
@@ -270,7 +277,7 @@ class _Server:
             return
         if changed:
             self._state_faults.apply(self._inbox)
-            self._present = frozenset(fault for fault in FAULTS if self._inbox.find(*fault))
+            self._present = frozenset(fault for fault in ARM_FAULTS if self._inbox.find(*fault))
             for port in self._ports:
                 for client in port.clients:
                     client.outbox.delay_s = self._delay_s(port)

@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calibration.solve.handeye import jacobian, pose_noise, predict, refine, reject_outliers
-from calibration.solve.rigid import change, difference
+from calibration.solve.handeye import jacobian, predict, refine, reject_outliers
+from calibration.solve.se3 import change, difference
+from calibration.solve.variance_components import pose_noise
 from tests.calibration.synthetic import as_poses, make_views, with_outliers
 
 MOUNTS = pytest.mark.parametrize("mount", ["fixed", "flange"])

@@ -14,7 +14,7 @@ from calibration.solve.board_pose import (
     without_false_corners,
 )
 from calibration.solve.projection import CornerStack, intrinsics_vector, project, stack_corners
-from calibration.solve.rigid import change, difference, invert
+from calibration.solve.se3 import change, difference, invert
 from calibration.solve.views import Corners
 from robotcell.config.calibration_file import PointBoard
 from robotcell.geometry.transforms import make_transform

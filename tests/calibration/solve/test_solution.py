@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from calibration.solve.solution import save_if_better
-from calibration.solve.solver import solve
+from calibration.solve.pipeline import solve
+from calibration.solve.saving import save_if_better
 from robotcell.config import load_config
 from robotcell.config.calibration_file import load_calibration
 from robotcell.errors import CalibrationError, ConfigError

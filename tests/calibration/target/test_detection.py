@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from calibration.solve.views import Corners
-from calibration.target.board import DEFAULT_BOARD, draw_plate
 from calibration.target.detection import Detector, average, draw
+from robotcell.perception.board_plate import DEFAULT_BOARD, draw_plate
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from policy.evaluation.metrics import measure
 from policy.evaluation.page import write_page
 from policy.evaluation.report import results_table
 from policy.evaluation.trials import Failure
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, StorageError
 from tests.policy.evaluation.examples import ORIGIN, result, run, settings
 
 
@@ -80,7 +80,7 @@ def test_a_page_that_cannot_be_made_says_why(folder):
     with pytest.raises(ConfigError, match=r"gone.jpg: No such file"):
         write_page(folder, settings(), ORIGIN, [result(shown=(gone,))])
     (folder / "index.html").mkdir()
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         write_page(folder, settings(), ORIGIN, [result()])
 
 

@@ -15,7 +15,7 @@ from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Devices
 from sim_twin.d415.renderer import SERIAL
-from sim_twin.wire.d415.server import FAULTS, WRONG_SERIAL
+from sim_twin.wire.d415.server import CAMERA_FAULTS, WRONG_SERIAL
 from sim_twin.wire.faults import Kind
 from tests.robotcell.config.test_calibration_file import values
 from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE, ServedCamera
@@ -110,7 +110,7 @@ def names(rows):
 
 
 def test_every_fault_that_the_camera_declares_is_tried():
-    assert {tuple(row[:3]) for row in WHILE_STREAMING} == FAULTS
+    assert {tuple(row[:3]) for row in WHILE_STREAMING} == CAMERA_FAULTS
 
 
 @pytest.mark.parametrize("row", WHILE_STREAMING, ids=names(WHILE_STREAMING))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, PERIOD_S, Record
+from sim_twin.wire.ur.controller import UNLOCK_AFTER_S
 from sim_twin.wire.ur.server import serve_ur
 
 if TYPE_CHECKING:
@@ -27,8 +28,9 @@ class ServedController:
     `push` is the force (3,) [N] on arm and tool, and `held` keeps the joints where they are.
     """
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str, unlock_after_s: float = UNLOCK_AFTER_S) -> None:
         self.host = host
+        self.unlock_after_s = unlock_after_s
         self.push = np.zeros(3)
         self.held = False
         self.endpoints: dict[str, str] = {}
@@ -44,7 +46,8 @@ class ServedController:
         self._thread = threading.Thread(target=self._follow)
         self._thread.start()
         self.process = context.Process(
-            target=serve_ur, args=(self.host, START_Q, self.command.name, self.state.name, far_faults, ready)
+            target=serve_ur,
+            args=(self.host, START_Q, self.unlock_after_s, self.command.name, self.state.name, far_faults, ready),
         )
         self.process.start()
         far_faults.close()

@@ -22,7 +22,8 @@ LIMIT_S = 60
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[ServedController]:
-    with ServedController(HOST) as controller:
+    # The client waits for it: 5 s, as on a real controller, are tested where time is simulated.
+    with ServedController(HOST, unlock_after_s=2.0) as controller:
         yield controller
 
 

@@ -20,7 +20,7 @@ from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.pose import matrix_to_pose
 from sim_twin.wire.ur.program import Program, ScriptError
 from sim_twin.wire.ur.script import ScriptReader
-from sim_twin.wire.ur.server import FAULTS
+from sim_twin.wire.ur.server import ARM_FAULTS
 from sim_twin.wire.ur.snapshot import Snapshot
 from sim_twin.wire.ur.state_faults import StateFaults
 from sim_twin.wire.ur.statements import run_at_once, run_statements
@@ -506,7 +506,7 @@ def test_tcp_and_payload_that_are_not_taken(stepped: SteppedControlLoop, inject:
 
 
 def test_the_declared_faults_are_those_that_are_known() -> None:
-    assert {what for channel, _, what in FAULTS if channel == "state"} >= {
+    assert {what for channel, _, what in ARM_FAULTS if channel == "state"} >= {
         *("local_control", "power_off", "brakes_locked", "booting", "protective_stop", "safeguard_stop"),
         *("emergency_stop", "violation", "speed_slider", "program_stopped", "program_paused", "never_arrives"),
         *("tcp", "payload"),

@@ -183,7 +183,8 @@ def stops(host: str) -> dict[str, Any]:
     got["state"] = [receive.getSafetyMode(), receive.getRuntimeState(), control.isProgramRunning()]
     got["refused"] = control.moveJ(START, 1.0, 2.0)
     got["early"] = said(dashboard.unlockProtectiveStop)
-    time.sleep(5.1)
+    # The served controller of the tests can be unlocked after 2 s.
+    time.sleep(2.1)
     dashboard.closeSafetyPopup()
     dashboard.unlockProtectiveStop()
     control.reuploadScript()
