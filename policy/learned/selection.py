@@ -25,7 +25,7 @@ _DILATIONS = 15
 _APART = 3
 _PUSH_TRIES = 400
 # The Q of a push loses so much by each cell that its way passes beside the middle of what it is to free
-# (`docs/policy.md`).
+# (`docs/explanation/experiments/push-ranking.md`).
 _BESIDE = 0.015
 # Pushes side by side whose ways are nearer to each other than this do much the same [cells].
 _LANE = 10
