@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import itertools
 import json
 import os
 import re
@@ -217,7 +218,14 @@ def _journal(_words: str, _page: str) -> str:
     lines = []
     for mapper in journal_tables.Base.__subclasses__():
         told = _columns(mapper)
-        lines += [f"### `{mapper.__tablename__}`", "", _first_paragraph(mapper), "", "| column | type | |", "|---|---|---|"]
+        lines += [
+            f"### `{mapper.__tablename__}`",
+            "",
+            _first_paragraph(mapper),
+            "",
+            "| column | type | |",
+            "|---|---|---|",
+        ]
         for column in mapper.__table__.columns:
             kind = f"{column.type}{'' if not column.nullable else ' or null'}".lower()
             link = "".join(f" (`{key.target_fullname}`)" for key in column.foreign_keys)
@@ -229,7 +237,7 @@ def _journal(_words: str, _page: str) -> str:
 def _columns(mapper: type) -> dict[str, str]:
     lines = inspect.getsource(mapper).splitlines()
     told: dict[str, str] = {}
-    for above, line in zip(lines, lines[1:], strict=False):
+    for above, line in itertools.pairwise(lines):
         field = re.match(r"    (\w+): Mapped", line)
         if field and above.strip().startswith("#"):
             told[field[1]] = _cell(above.strip().lstrip("# "))

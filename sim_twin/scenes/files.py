@@ -1,7 +1,7 @@
 """Scenes from files: the twin's own TOML format, and the two text formats of the published block scenes.
 
-docs/reference/scene-files.md describes all three. Metres, radians; a scene's frame has x and y from the centre of the workspace
-and z from the table top.
+docs/reference/scene-files.md describes all three. Metres, radians; a scene's frame has x and y from the centre of the
+workspace and z from the table top.
 """
 
 from __future__ import annotations

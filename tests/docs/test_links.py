@@ -1,4 +1,4 @@
-"""Pages that code, examples and the files beside the site name are there. `make docs` checks the links inside the site."""
+"""The pages that code, examples and READMEs name are there. `make docs` checks the links inside the site."""
 
 from __future__ import annotations
 
@@ -28,4 +28,3 @@ def test_the_pages_that_are_named_exist(source: Path) -> None:
     if source.suffix == ".md":
         missing += [link for link in LINK.findall(text) if not (source.parent / link).exists()]
     assert not missing
-
