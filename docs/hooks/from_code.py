@@ -93,7 +93,12 @@ def _descriptions(model: type[BaseModel]) -> dict[str, str]:
                 if above:
                     said[node.target.id] = " ".join(above)
     said |= _attributes(inspect.getdoc(model) or "")
-    return {key: _cell(text[0].upper() + text[1:]) for key, text in said.items()}
+    return {key: _cell(_capitalised(text)) for key, text in said.items()}
+
+
+def _capitalised(text: str) -> str:
+    """A sentence begins with a capital, but x stays x."""
+    return text if re.match(r"\w\b", text) else text[0].upper() + text[1:]
 
 
 def _attributes(doc: str) -> dict[str, str]:
@@ -157,7 +162,7 @@ def _kind(annotation: Any) -> str:
     if origin is tuple:
         if args[-1] is Ellipsis:
             return f"list of {_kind(args[0])}"
-        return f"{len(args)} x {_kind(args[0])}"
+        return f"{len(args)} {_kind(args[0])}s"
     if origin is dict or annotation is dict:
         return "table"
     return {float: "number", int: "whole number", bool: "true or false", str: "text", Path: "path"}[annotation]
