@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from policy.barred import repeats_grasp, repeats_push
-from policy.shadows import cell_centers, estimate_surface
+from policy.map_grid import cell_centers
+from policy.shadows import complete_heights
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import Uncover
 from robotcell.motion.grasp import Grasp
@@ -58,7 +59,7 @@ class RandomPolicy:
             NoTarget: no object is seen, or every action on those that are has failed.
         """
         targets = observation.targets()
-        heights = estimate_surface(observation.heightmap, self._camera, self._table_height_m).height_m
+        heights = complete_heights(observation.heightmap, self._camera, self._table_height_m).height_m
         draws = [] if isinstance(observation.task, Uncover) else [self._grasp]
         if observation.may_push:
             draws.append(self._push)

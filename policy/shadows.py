@@ -1,6 +1,6 @@
-"""What a policy assumes about cells that the camera did not see.
+"""The heights of occluded cells: what may stand where the camera did not see.
 
-Unknown is not floor. A cell is unknown because the line of sight to it is blocked, which bounds what can be there
+Unknown is not floor. A cell is occluded because the line of sight to it is blocked, which bounds what can be there
 from above; and what the camera sees where the shadow ends is the best guess at what begins inside it.
 """
 
@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from robotcell.config import Workspace
     from robotcell.geometry.transforms import Array
     from robotcell.perception.heightmap import Heightmap
 
@@ -27,8 +26,8 @@ _SPIKE_M = 0.010
 
 
 @dataclass(frozen=True)
-class Surface:
-    """Heights above the table without gaps.
+class CompletedHeights:
+    """Heights above the table, completed where the camera did not see.
 
     Attributes:
         height_m: (H, W) as seen, or else the likely height.
@@ -39,16 +38,9 @@ class Surface:
     ceiling_m: Heights
 
 
-def cell_centers(workspace: Workspace, rows: npt.NDArray[np.intp], cols: npt.NDArray[np.intp]) -> tuple[Array, Array]:
-    """Positions x and y [m] of the centres of cells."""
-    x = workspace.x[0] + (cols + 0.5) * workspace.resolution_m
-    y = workspace.y[0] + (rows + 0.5) * workspace.resolution_m
-    return np.asarray(x, np.float64), np.asarray(y, np.float64)
-
-
-def estimate_surface(
+def complete_heights(
     heightmap: Heightmap, camera: Array, table_height_m: float, wanted: npt.NDArray[np.bool_] | None = None
-) -> Surface:
+) -> CompletedHeights:
     """Complete a heightmap along the lines of sight.
 
     Going from an unknown cell towards the camera, each seen cell bounds what may be hidden: the line from the
@@ -84,7 +76,7 @@ def estimate_surface(
         )
     height[rows, cols] = np.clip(np.nan_to_num(likely, nan=0.0), 0, bound)
     ceiling[rows, cols] = bound
-    return Surface(height, ceiling)
+    return CompletedHeights(height, ceiling)
 
 
 def _without_spikes(height_m: Heights) -> Heights:

@@ -26,6 +26,7 @@ from policy.evaluation.trials import Failure, Trial, TrialResult, run_trial
 from policy.rollouts import run_tasks
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
+from robotcell.io.atomic_file import make_folder, write_whole
 from robotcell.jobs.run_folder import make_run_dir
 from robotcell.motion.config_check import check_config
 
@@ -114,15 +115,15 @@ def start(settings: Settings) -> Path:
     """A new folder for a benchmark, under `journal.runs` of its cell.
 
     Raises:
-        ConfigError: it cannot be made.
+        StorageError: it cannot be made or written to.
     """
     folder = make_run_dir(settings.cell.journal.runs, "bench")
     # A database URL may hold a password, and no trial uses it.
     cell = settings.cell.model_dump(mode="json", exclude={"journal": {"url"}})
     origin = Origin(datetime.now().astimezone().isoformat(timespec="seconds"), _versions())
     head = {"version": FORMAT_VERSION, **asdict(origin), "settings": {**vars(settings), "cell": cell}}
-    (folder / _SETTINGS_FILE).write_text(json.dumps(head, indent=1) + "\n", encoding="utf-8")
-    (folder / PICTURES).mkdir()
+    write_whole(folder / _SETTINGS_FILE, json.dumps(head, indent=1) + "\n")
+    make_folder(folder / PICTURES)
     return folder
 
 
@@ -209,7 +210,7 @@ def write_json(path: Path, settings: Settings, origin: Origin, results: Sequence
     """Write all metrics and trials.
 
     Raises:
-        ConfigError: the file cannot be written.
+        StorageError: the file cannot be written.
     """
     figures = {suite: {name: asdict(m) for name, m in row.items()} for suite, row in by_suite(results).items()}
     document = {
@@ -219,10 +220,7 @@ def write_json(path: Path, settings: Settings, origin: Origin, results: Sequence
         "metrics": figures,
         "trials": [asdict(result) for result in results],
     }
-    try:
-        path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
+    write_whole(path, json.dumps(document, indent=1) + "\n")
 
 
 def _result(values: dict[str, Any]) -> TrialResult:

@@ -7,10 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from policy.barred import repeats_grasp, repeats_push
-from policy.grasp_room import Jaw, find_grasps, lay_table
-from policy.heuristic.pushing import find_pushes
-from policy.shadows import Surface, cell_centers, estimate_surface
+from policy.antipodal import antipodal_grasps
+from policy.barred import repeats_grasp
+from policy.finger_clearance import OpenGripper, pad_maps
+from policy.map_grid import cell_centers, check_resolution, workspace_at
+from policy.push.border import USEFUL_GAIN
+from policy.push.outcome import PushForwardModel
+from policy.push.value import PushValue, evaluate_pushes
+from policy.shadows import complete_heights
 from robotcell.errors import NoTarget
 from robotcell.jobs.policy_api import PickAny, Uncover
 from robotcell.motion.grasp import Grasp
@@ -20,10 +24,10 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig, Workspace
     from robotcell.jobs.policy_api import Action, Observation
 
+# Half the step at which the profile between the fingers is sampled would be finer than a camera at 1 m tells.
+RESOLUTION_M = 0.002
 # A grasp that scores less is worth a push first, where one is allowed.
 CLEAR_GRASP = 0.30
-# A push must promise at least this much (the paper's tau, a gain of a tenth of the goal's border).
-USEFUL_PUSH = 0.10
 
 
 class HeuristicPolicy:
@@ -36,15 +40,15 @@ class HeuristicPolicy:
     name = "heuristic"
 
     def __init__(self, config: CellConfig) -> None:
-        self._workspace = config.workspace
+        self._workspace = workspace_at(config.workspace, RESOLUTION_M)
         self._camera = config.camera.pose()[:3, 3]
         self._table_height_m = config.table.height_m
         self._push_m = config.motion.push_m
-        self._jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+        self._gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
 
     @property
     def workspace(self) -> Workspace:
-        """That of the cell."""
+        """That of the cell, in cells of 2 mm."""
         return self._workspace
 
     def decide(self, observation: Observation) -> Action:
@@ -52,16 +56,15 @@ class HeuristicPolicy:
 
         Raises:
             NoTarget: no object is seen, or nothing can be done about those that are.
+            ConfigError: the map is of another resolution than `workspace`.
         """
+        check_resolution(observation.heightmap.workspace, self._workspace, self.name)
         targets = observation.targets()
-        surface = estimate_surface(observation.heightmap, self._camera, self._table_height_m)
-        grasp = None
-        if not isinstance(observation.task, Uncover):
-            grasp = self._best_grasp(surface, targets, observation)
+        grasp = None if isinstance(observation.task, Uncover) else self._grasp(observation, targets)
         if grasp is not None and grasp.q_value >= CLEAR_GRASP:
             return grasp
-        push = self._best_push(surface, observation) if observation.may_push else None
-        if push is not None and (grasp is None or push.q_value >= USEFUL_PUSH):
+        push = self._push(observation) if observation.may_push else None
+        if push is not None and (grasp is None or push.q_value > USEFUL_GAIN):
             return push
         if grasp is not None:
             return grasp
@@ -70,32 +73,38 @@ class HeuristicPolicy:
             "rearrange the objects by hand, or choose another goal"
         )
 
-    def _best_grasp(self, surface: Surface, targets: npt.NDArray[np.bool_], observation: Observation) -> Grasp | None:
+    def _grasp(self, observation: Observation, targets: npt.NDArray[np.bool_]) -> Grasp | None:
         """The best grasp that repeats no failure."""
-        workspace = observation.heightmap.workspace
-        table = lay_table(surface, _owners(observation), workspace.resolution_m, self._jaw.opening_m)
-        found = find_grasps(table, targets, self._jaw)
+        heightmap = observation.heightmap
+        heights = complete_heights(heightmap, self._camera, self._table_height_m)
+        maps = pad_maps(heights, _owners(observation), RESOLUTION_M, self._gripper.opening_m)
+        found = antipodal_grasps(maps, targets, self._gripper)
         score = found.score.copy()
-        score[repeats_grasp(*cell_centers(workspace, found.row, found.col), found.rotation, observation.barred)] = 0
+        x, y = cell_centers(heightmap.workspace, found.row, found.col)
+        score[repeats_grasp(x, y, found.rotation, observation.barred)] = 0
         if not score.any():
             return None
         best = int(score.argmax())
-        x, y = workspace.position(int(found.row[best]), int(found.col[best]))
-        return Grasp(x, y, float(found.surface_m[best]), int(found.rotation[best]), float(score[best]))
+        surface_m, rotation = float(found.surface_m[best]), int(found.rotation[best])
+        return Grasp(float(x[best]), float(y[best]), surface_m, rotation, float(score[best]))
 
-    def _best_push(self, surface: Surface, observation: Observation) -> Push | None:
-        """The best push that repeats no failure."""
-        workspace = observation.heightmap.workspace
-        goal = None if isinstance(observation.task, PickAny) else 1
-        found = find_pushes(surface, _instances(observation), goal, workspace, self._push_m)
-        score = found.score.copy()
-        score[repeats_push(*cell_centers(workspace, found.row, found.col), found.rotation, observation.barred)] = 0
-        if not score.any():
+    def _push(self, observation: Observation) -> Push | None:
+        """The best push that moves something."""
+        heightmap = observation.heightmap
+        model = PushForwardModel(observation.labels, heightmap)
+        found = evaluate_pushes(observation, model, self._push_m, lambda cells: np.zeros(cells.shape, np.float32))
+        found = [push for push in found if push.moves]
+        if not found:
             return None
-        best = int(score.argmax())
-        start = workspace.position(int(found.row[best]), int(found.col[best]))
-        top_m, value = float(found.surface_m[best]), float(score[best])
-        return push_in_workspace(start, int(found.rotation[best]), self._push_m, top_m, value, workspace)
+        best = max(found, key=_worth)
+        line, workspace = best.candidate.line, heightmap.workspace
+        start = workspace.position(line.row, line.col)
+        return push_in_workspace(start, best.candidate.rotation, self._push_m, line.top_m, _worth(best), workspace)
+
+
+def _worth(push: PushValue) -> float:
+    """What a push frees of its object's border, or of what hides a goal, less what it may lose."""
+    return push.gain + push.uncovered - push.loss
 
 
 def _owners(observation: Observation) -> npt.NDArray[np.int32]:
@@ -103,11 +112,3 @@ def _owners(observation: Observation) -> npt.NDArray[np.int32]:
     if isinstance(observation.task, PickAny):
         return observation.labels
     return np.where(observation.task.mask, 1, np.where(observation.objects, 2, 0)).astype(np.int32)
-
-
-def _instances(observation: Observation) -> npt.NDArray[np.int32]:
-    """(H, W) labels of the objects; a goal is 1."""
-    labels = observation.labels
-    if isinstance(observation.task, PickAny):
-        return labels
-    return np.where(observation.task.mask, 1, np.where(labels > 0, labels + 1, 0)).astype(np.int32)

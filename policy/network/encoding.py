@@ -6,6 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 CHANNELS = 5
+# Cells of the maps that the networks are trained on and work at (paper: 2 mm).
+RESOLUTION_M = 0.002
 
 # Brings block heights (2.5 to 10 cm) to the order of one.
 _HEIGHT_SCALE_M = 0.05

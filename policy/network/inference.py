@@ -12,15 +12,19 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from policy.network.encoding import RESOLUTION_M
 from policy.network.precision import autocast
 from policy.network.q_network import GRASP, PUSH
-from policy.network.rotation import MARGIN, Copies
+from policy.network.rotation import Copies
 from policy.network.weights import load_weights
 from robotcell.motion.rotations import GRASP_ROTATIONS, ROTATIONS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+# How far around its cell a Q value depends on what stands there: the fingers' reach, and what a push meets first.
+# Copies that show more tell labelled attempts apart no better (`docs/policy.md`).
+MARGIN_M = 0.064
 _PLANES = {GRASP: GRASP_ROTATIONS, PUSH: ROTATIONS}
 # Cells of copies that pass the network at once: what the paper's network keeps of them takes 1 GB. Neither network is
 # faster on more.
@@ -32,9 +36,11 @@ class Inference:
 
     Args:
         network: Q maps of grasps and pushes along +x, see `policy.network.q_network.QNetwork`.
+        margin_m: how far around the cells in question the network is shown the map.
     """
 
-    def __init__(self, network: nn.Module) -> None:
+    def __init__(self, network: nn.Module, margin_m: float = MARGIN_M) -> None:
+        self._margin = round(margin_m / RESOLUTION_M)
         self._network = copy.deepcopy(network).eval()
         fuse_norms(self._network)
         self._network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
@@ -60,7 +66,7 @@ class Inference:
         """
         each = np.broadcast_to(cells, (_PLANES[primitive], *cells.shape[-2:]))
         rotations = np.flatnonzero(each.any(axis=(1, 2)))
-        copies = Copies.around(each[rotations], rotations.tolist(), MARGIN)
+        copies = Copies.around(each[rotations], rotations.tolist(), self._margin)
         x = torch.from_numpy(copies.turn(planes))
         at_once = max(1, _CELLS_AT_ONCE // math.prod(copies.shape))
         with torch.inference_mode(), autocast(x.device):

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
     from robotcell.geometry.transforms import Array
 
-# How far around its cell a Q value depends on what stands there [cells]: the fingers' reach, and what a push meets
-# first. Copies that show more tell labelled attempts apart no better (`docs/explanation/experiments/networks.md`).
-MARGIN = 32
 # Sides of a copy: the network halves it four times.
 _MULTIPLE = 16
 

@@ -1,7 +1,8 @@
 """Trained weights as safetensors files: what they are of, how they came about, and whether they are whole.
 
 The metadata of a file are strings: `format`, the version of these rules; `architecture`, a name of
-`policy.network.registry.NETWORKS`; `sha256` over all else in the file; and the card, free entries of whoever wrote it,
+`policy.network.registry.NETWORKS`; `resolution_m`, the size of the cells that it was trained on (`RESOLUTION_M` where
+the entry is missing); `sha256` over all else in the file; and the card, free entries of whoever wrote it,
 such as the training configuration and the evaluation as JSON.
 """
 
@@ -16,6 +17,7 @@ import numpy as np
 import safetensors.torch
 import torch
 
+from policy.network.encoding import RESOLUTION_M
 from policy.network.registry import make_network
 from robotcell.errors import ConfigError
 from robotcell.io.atomic_file import replaced
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 NAMED = ("learned", "single-stage")
 
 _FORMAT = "1"
-_RESERVED = {"format", "architecture", "sha256"}
+_RESERVED = {"format", "architecture", "resolution_m", "sha256"}
 # A file that would be larger holds its convolutions as float16.
 _LARGE_BYTES = 8_000_000
 
@@ -49,7 +51,8 @@ def save_weights(path: Path, network: nn.Module, architecture: str, card: Mappin
 
     Raises:
         ConfigError: the card uses a reserved name, the network is not of that architecture or has values that are not
-            finite, or the file cannot be written.
+            finite.
+        StorageError: the file cannot be written.
     """
     what = f"weights for {path}"
     taken = sorted(card.keys() & _RESERVED)
@@ -60,13 +63,10 @@ def save_weights(path: Path, network: nn.Module, architecture: str, card: Mappin
     if sum(tensor.nbytes for tensor in tensors.values()) > _LARGE_BYTES:
         tensors = {name: tensor.half() if tensor.ndim >= 2 else tensor for name, tensor in tensors.items()}
     _check_finite(tensors, what, "the training diverged, go back to an earlier state")
-    metadata = {**card, "format": _FORMAT, "architecture": architecture}
+    metadata = {**card, "format": _FORMAT, "architecture": architecture, "resolution_m": str(RESOLUTION_M)}
     content = safetensors.torch.save(tensors, {**metadata, "sha256": _digest(tensors, metadata)})
-    try:
-        with replaced(path) as part:
-            part.write_bytes(content)
-    except OSError as error:
-        raise ConfigError(f"{what}: cannot be written ({error.strerror}); choose another folder") from error
+    with replaced(path) as part:
+        part.write_bytes(content)
 
 
 def load_weights(path: Path) -> tuple[nn.Module, dict[str, str]]:
@@ -80,6 +80,11 @@ def load_weights(path: Path) -> tuple[nn.Module, dict[str, str]]:
     if metadata.get("format") != _FORMAT:
         found = f"of format {metadata['format']!r}" if "format" in metadata else "without a format: not written by us"
         raise ConfigError(f"{what}: {found}; this program reads format {_FORMAT!r}, save them again with it")
+    if metadata.get("resolution_m", str(RESOLUTION_M)) != str(RESOLUTION_M):
+        raise ConfigError(
+            f"{what}: trained on cells of {metadata['resolution_m']} m, and this program shows networks cells of "
+            f"{RESOLUTION_M} m; choose other weights, or train again"
+        )
     network = _blank(metadata.get("architecture", ""), what)
     _check_fit(tensors, network, what, "fetch the file again, or save it again with this version of the program")
     sealed = {name: value for name, value in metadata.items() if name != "sha256"}

@@ -6,31 +6,35 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Paper: the border is 10 dilations wide; a cell of it from 2 cm to 30 cm high is occupied.
-_DILATIONS = 10
+# Paper: the border is 10 dilations by cells of 2 mm wide.
+_BORDER_M = 0.020
+# Paper, stage II: a push that frees more than tau of its object's border earns the reward, and is worth making.
+USEFUL_GAIN = 0.1
+# Paper: a cell of the border that is so high is occupied.
 _OCCUPIED_M = (0.02, 0.30)
 
 
-def border_cells(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+def border_cells(mask: npt.NDArray[np.bool_], resolution_m: float) -> npt.NDArray[np.intp]:
     """(N, 2) row and column of the cells around an object (H, W)."""
     rows, cols = np.nonzero(mask)
     if not len(rows):
         return np.empty((0, 2), np.intp)
-    pad = _DILATIONS + 1
+    breadth = round(_BORDER_M / resolution_m)
+    pad = breadth + 1
     top, left = max(0, rows.min() - pad), max(0, cols.min() - pad)
     inner = mask[top : rows.max() + pad, left : cols.max() + pad].astype(np.uint8)
-    ring = (cv2.dilate(inner, np.ones((3, 3), np.uint8), iterations=_DILATIONS) > 0) & (inner == 0)
+    ring = (cv2.dilate(inner, np.ones((3, 3), np.uint8), iterations=breadth) > 0) & (inner == 0)
     return np.asarray(np.argwhere(ring) + np.array([top, left]), np.intp)
 
 
-def stands(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
-    """Whether something stands at cells of that height; nothing that was not seen does (NaN)."""
+def is_occupied(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Whether cells of that height are occupied; those that were not seen (NaN) are not."""
     low, high = _OCCUPIED_M
     with np.errstate(invalid="ignore"):
         return np.asarray((height_m > low) & (height_m < high))
 
 
-def border_occupancy(mask: npt.NDArray[np.bool_], height_m: npt.NDArray[np.float32]) -> float:
+def border_occupancy(mask: npt.NDArray[np.bool_], height_m: npt.NDArray[np.float32], resolution_m: float) -> float:
     """Share of the cells around an object that something stands on (paper, stage II: m_r)."""
-    rows, cols = border_cells(mask).T
-    return float(stands(height_m[rows, cols]).mean()) if len(rows) else 0.0
+    rows, cols = border_cells(mask, resolution_m).T
+    return float(is_occupied(height_m[rows, cols]).mean()) if len(rows) else 0.0

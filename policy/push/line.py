@@ -30,8 +30,8 @@ _FREE_RADIUS_M = 0.016
 _FREE_HEIGHT_M = 0.008
 # Cranks and body of the gripper keep this distance from what they pass.
 _SIDE_MARGIN_M = 0.003
-# Where something is too high for them, the fingers come down so much farther back [cells].
-_STEPS_BACK = (0, 2, 4, 6)
+# Where something is too high for them, the fingers come down so much farther back.
+_STEPS_BACK_M = (0.0, 0.004, 0.008, 0.012)
 # The push must still go on for this far behind the cell that it was chosen for.
 _FOLLOW_M = 0.010
 # The height of what is met is taken over so much of its face: the first cells of an edge are uncertain.
@@ -114,8 +114,8 @@ def _line_from(
 
     None where there is no such place, or where the push meets nothing.
     """
-    for back in _STEPS_BACK:
-        row, col = np.rint(start - back * _direction(rotation)).astype(np.intp).tolist()
+    for back_m in _STEPS_BACK_M:
+        row, col = np.rint(start - round(back_m / resolution_m) * _direction(rotation)).astype(np.intp).tolist()
         if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1] and free[row, col]):
             return None
         line = _line((row, col), height_m, rotation, push_m, resolution_m)

@@ -1,4 +1,4 @@
-"""What a push would do, played ahead: where the objects would come to stand, and what would be seen around them."""
+"""The forward model of pushes: where the objects come to stand, and what is then seen around them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import find_objects
 
-from policy.push.border import border_cells, stands
-from policy.push.physics import Prism, SlidingTable
+from policy.push.border import border_cells, is_occupied
+from policy.push.physics import PlanarPhysics, Prism
 from robotcell.motion.rotations import ROTATIONS
 from robotcell.perception.heightmap import upper_height
 from robotcell.perception.segmentation import MIN_OBJECT_M
@@ -35,11 +35,11 @@ _CLEAR_M = 0.002
 
 
 @dataclass(frozen=True)
-class Played:
+class PushOutcome:
     """What came of a push.
 
     Attributes:
-        moves: by label of each object that moved, see `policy.push.physics.SlidingTable.push`.
+        moves: by label of each object that moved, see `policy.push.physics.PlanarPhysics.push`.
         lost: labels of those that came so near to the rim of the workspace that they may leave it.
     """
 
@@ -47,7 +47,7 @@ class Played:
     lost: frozenset[int]
 
 
-_NOTHING = Played({}, frozenset())
+_NOTHING = PushOutcome({}, frozenset())
 
 
 class Window(NamedTuple):
@@ -65,8 +65,8 @@ class Window(NamedTuple):
     border: npt.NDArray[np.intp]
 
 
-class Foresight:
-    """The objects of one view.
+class PushForwardModel:
+    """The objects of one view, and what a push makes of them.
 
     Args:
         labels: (H, W) the object in each cell, 0 for none.
@@ -82,59 +82,61 @@ class Foresight:
         self._cells = {i: (box, labels[box] == i) for i, box in enumerate(boxes, start=1) if box is not None}
         self._alone = {i: np.where(own, self._height_m[box], np.float32(0)) for i, (box, own) in self._cells.items()}
         self._prisms = {i: prism for i in self._cells if (prism := self._prism(i)) is not None}
-        self._table = SlidingTable(self._prisms)
+        self._physics = PlanarPhysics(self._prisms)
         self._windows: dict[int, Window] = {}
         self._occupied: dict[int, float] = {}
 
-    def play(self, line: PushLine, rotation: int) -> Played:
-        """Move the closed fingers along a push."""
+    def predict(self, line: PushLine, rotation: int) -> PushOutcome:
+        """What the closed fingers do that move along a push."""
         start = (np.array([line.col, line.row]) + 0.5) * self._resolution_m
         length_m = (len(line.cells) - 1) * self._resolution_m
         # The paper pushes at half of the height of what is met.
-        moves = self._table.push(start, 2 * math.pi * rotation / ROTATIONS, length_m, line.top_m / 2 + _CLEAR_M)
+        moves = self._physics.push(start, 2 * math.pi * rotation / ROTATIONS, length_m, line.top_m / 2 + _CLEAR_M)
         lost = frozenset(i for i, move in moves.items() if self._may_be_lost(self._prisms[i], move))
-        return Played(moves, lost)
+        return PushOutcome(moves, lost)
 
     def window(self, label: int) -> Window:
         """What is seen of an object and of what stands around it."""
         if label not in self._windows:
             (rows, cols), own = self._cells[label]
             shown = np.pad(own, self._pad)
-            self._windows[label] = Window(rows.start - self._pad, cols.start - self._pad, shown, border_cells(shown))
+            self._windows[label] = Window(
+                rows.start - self._pad, cols.start - self._pad, shown, border_cells(shown, self._resolution_m)
+            )
         return self._windows[label]
 
-    def alone(self, label: int) -> npt.NDArray[np.float32]:
+    def height_alone(self, label: int) -> npt.NDArray[np.float32]:
         """(h, w) heights in the window of an object if there were no other."""
         return np.pad(self._alone[label], self._pad)
 
-    def around(self, label: int, played: Played) -> npt.NDArray[np.float32]:
+    def height_around(self, label: int, outcome: PushOutcome) -> npt.NDArray[np.float32]:
         """(h, w) heights in the window of an object after a push; the window goes and turns with the object."""
         window = self.window(label)
-        here = played.moves.get(label, _STAYS)
-        others = {other: move for other, move in played.moves.items() if other != label}
+        here = outcome.moves.get(label, _STAYS)
+        others = {other: move for other, move in outcome.moves.items() if other != label}
         heights = self._after((window.top, window.left), window.own.shape, here, others, {*others, label})
-        np.copyto(heights, self.alone(label), where=window.own)
+        np.copyto(heights, self.height_alone(label), where=window.own)
         return heights
 
-    def uncovered(self, cells: npt.NDArray[np.bool_], played: Played) -> float:
+    def uncovered_share(self, cells: npt.NDArray[np.bool_], outcome: PushOutcome) -> float:
         """Share of cells (H, W) on which nothing stands any more after a push."""
-        heights = self._after((0, 0), cells.shape, _STAYS, played.moves, set(played.moves))
+        heights = self._after((0, 0), cells.shape, _STAYS, outcome.moves, set(outcome.moves))
         return float((heights[cells] < MIN_OBJECT_M).mean())
 
-    def freed(self, label: int, around: npt.NDArray[np.float32]) -> float:
+    def border_gain(self, label: int, around_m: npt.NDArray[np.float32]) -> float:
         """How much of an object's border a push frees: the fall in the share that others stand on (paper, stage II).
 
         Args:
             label: of the object.
-            around: what the push makes of its window.
+            around_m: (h, w) heights in its window after the push (`height_around`).
         """
         if label not in self._occupied:
-            self._occupied[label] = self._share(label, self.around(label, _NOTHING))
-        return self._occupied[label] - self._share(label, around)
+            self._occupied[label] = self._share(label, self.height_around(label, _NOTHING))
+        return self._occupied[label] - self._share(label, around_m)
 
-    def _share(self, label: int, around: npt.NDArray[np.float32]) -> float:
+    def _share(self, label: int, around_m: npt.NDArray[np.float32]) -> float:
         rows, cols = self.window(label).border.T
-        return float(stands(around[rows, cols]).mean())
+        return float(is_occupied(around_m[rows, cols]).mean())
 
     def _after(
         self,

@@ -40,9 +40,9 @@ _LEFT_OVERLAP = 0.9**120
 _MOVED_M, _TURNED_RAD = 0.0005, 0.02
 # An outline that fills less of its hull is concave, and halved until its pieces are not, or too small to matter.
 _CONVEX = 0.82
-_LEAST_PART_CELLS = 9
-# An object of fewer cells is noise.
-_LEAST_CELLS = 12
+_LEAST_PART_M2 = 36e-6
+# What shows less than this of itself is noise.
+_LEAST_OBJECT_M2 = 48e-6
 # Which of the shapes meet: objects each other, and what is high enough the tips and the cranks.
 _OBJECT, _REACHES_TIPS, _REACHES_CRANKS = 0b001, 0b010, 0b100
 # Objects so far behind the start or beyond the end of a push, and to its sides no farther than it is long, take part.
@@ -69,17 +69,20 @@ class Prism:
     def of(own: npt.NDArray[np.bool_], corner: tuple[int, int], height_m: float, resolution_m: float) -> Prism | None:
         """From the cells (h, w) of an object, the first at row and column `corner`; None for less than an object."""
         rows, cols = np.nonzero(own)
-        if len(rows) < _LEAST_CELLS:
+        if len(rows) < round(_LEAST_OBJECT_M2 / resolution_m**2):
             return None
         middle = np.array([cols.mean(), rows.mean()])
-        parts = tuple((part - middle) * resolution_m for part in _convex_parts(own.astype(np.uint8)))
+        parts = tuple(
+            (part - middle) * resolution_m
+            for part in _convex_parts(own.astype(np.uint8), _LEAST_PART_M2 / resolution_m**2)
+        )
         if not parts:
             return None
         reach_m = max(float(np.hypot(*part.T).max()) for part in parts)
         return Prism(parts, (middle + 0.5 + corner[::-1]) * resolution_m, height_m, reach_m)
 
 
-class _Slider(NamedTuple):
+class _Body(NamedTuple):
     """A prism's body, its shapes, and the joints that are its friction on the table."""
 
     body: pymunk.Body
@@ -87,8 +90,8 @@ class _Slider(NamedTuple):
     joints: tuple[pymunk.Constraint, ...]
 
 
-class SlidingTable:
-    """Prisms on a table, at rest before every push.
+class PlanarPhysics:
+    """Prisms that closed fingers push over the plane of the table; at rest before every push.
 
     Args:
         prisms: by label.
@@ -101,7 +104,7 @@ class SlidingTable:
         self._reaches = np.array([prism.reach_m for prism in prisms.values()])
         self._ground = pymunk.Body(body_type=pymunk.Body.STATIC)
         # To make bodies takes longer than a push: they are made once, and belong to a space while they take part.
-        self._sliders = [_slider(self._ground, prism) for prism in prisms.values()]
+        self._bodies = [_body(self._ground, prism) for prism in prisms.values()]
         self._fingers = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self._gripper = (
             _fingers_shape(self._fingers, rg2.FINGER_THICKNESS_M, _REACHES_TIPS),
@@ -132,24 +135,24 @@ class SlidingTable:
         space.collision_slop, space.collision_bias = _OVERLAP_M, _LEFT_OVERLAP
         space.add(self._ground, self._fingers, *self._gripper)
         for i in taking_part:
-            body, shapes = self._sliders[i].body, self._sliders[i].shapes
+            body, shapes = self._bodies[i].body, self._bodies[i].shapes
             reaches = _REACHES_TIPS * bool(self._heights[i] > tip_m)
             reaches |= _REACHES_CRANKS * bool(self._heights[i] > tip_m + rg2.CRANKS_ABOVE_TIPS_M)
             for shape in shapes:
                 shape.filter = pymunk.ShapeFilter(categories=_OBJECT | reaches)
             body.position, body.angle = tuple(self._centers[i].tolist()), 0.0
             body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
-            space.add(body, *shapes, *self._sliders[i].joints)
+            space.add(body, *shapes, *self._bodies[i].joints)
         for _ in range(steps - idle):
             space.step(_STEP_S)
         moves = {self._labels[i]: move for i in taking_part if (move := self._move(i)) is not None}
         space.remove(self._ground, self._fingers, *self._gripper)
         for i in taking_part:
-            space.remove(*self._sliders[i].shapes, *self._sliders[i].joints)
+            space.remove(*self._bodies[i].shapes, *self._bodies[i].joints)
         # Uses up what the last step left to each body against its overlaps.
         space.step(_STEP_S)
         for i in taking_part:
-            space.remove(self._sliders[i].body)
+            space.remove(self._bodies[i].body)
         return moves
 
     def _ahead(self, start: Array, along: Array, length_m: float, tip_m: float) -> tuple[list[int], float]:
@@ -163,7 +166,7 @@ class SlidingTable:
         return np.flatnonzero(part).tolist(), float(free_m)
 
     def _move(self, i: int) -> Array | None:
-        body, (x, y) = self._sliders[i].body, self._centers[i]
+        body, (x, y) = self._bodies[i].body, self._centers[i]
         at, cos, sin = body.position, math.cos(body.angle), math.sin(body.angle)
         if max(abs(at.x - x), abs(at.y - y)) <= _MOVED_M and abs(sin) <= _TURNED_RAD:
             return None
@@ -177,7 +180,7 @@ def _fingers_shape(fingers: pymunk.Body, half_thickness_m: float, meets: int) ->
     return shape
 
 
-def _slider(ground: pymunk.Body, prism: Prism) -> _Slider:
+def _body(ground: pymunk.Body, prism: Prism) -> _Body:
     parts = [[(float(x), float(y)) for x, y in part] for part in prism.parts]
     areas = [cv2.contourArea(part.astype(np.float32)) for part in prism.parts]
     # The density is the same for all, and its value without meaning.
@@ -193,17 +196,20 @@ def _slider(ground: pymunk.Body, prism: Prism) -> _Slider:
     drag.max_bias, drag.max_force = 0.0, weight
     twist = pymunk.GearJoint(ground, body, 0.0, 1.0)
     twist.max_bias, twist.max_force = 0.0, _LEVER * math.sqrt(sum(areas) / math.pi) * weight
-    return _Slider(body, tuple(shapes), (drag, twist))
+    return _Body(body, tuple(shapes), (drag, twist))
 
 
-def _convex_parts(own: npt.NDArray[np.uint8]) -> list[Array]:
-    """Convex polygons, each (N, 2) column and row, that cover an object (h, w): its hull, or those of its halves."""
+def _convex_parts(own: npt.NDArray[np.uint8], least_area: float) -> list[Array]:
+    """Convex polygons, each (N, 2) column and row, that cover an object (h, w): its hull, or those of its halves.
+
+    Pieces of an area [cells] below `least_area` are left out.
+    """
     parts: list[Array] = []
     contours, _ = cv2.findContours(own, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
         hull = cv2.convexHull(contour)
         area = cv2.contourArea(hull)
-        if area < _LEAST_PART_CELLS:
+        if area < least_area:
             continue
         if cv2.contourArea(contour) > _CONVEX * area:
             parts.append(hull[:, 0].astype(np.float64))
@@ -216,5 +222,5 @@ def _convex_parts(own: npt.NDArray[np.uint8]) -> list[Array]:
             axis, middle = (0, row + rows // 2) if rows > cols else (1, col + cols // 2)
             window[axis] = slice(window[axis].start, middle) if half == 0 else slice(middle, window[axis].stop)
             corner = np.array([window[1].start, window[0].start])
-            parts += [part + corner for part in _convex_parts(np.ascontiguousarray(piece[tuple(window)]))]
+            parts += [part + corner for part in _convex_parts(np.ascontiguousarray(piece[tuple(window)]), least_area)]
     return parts

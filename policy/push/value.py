@@ -1,99 +1,114 @@
-"""What a push is good for: how well its object can be grasped once the push has made room around it."""
+"""What pushes are good for, by the forward model: the border that they free, what they uncover, what they may lose."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.grasp_room import Jaw, Table, finger_room
-from policy.learned.selection import Cells, best_cells, check_maps, faded, thinned
-from policy.network.encoding import encode
-from policy.network.q_network import GRASP
+from policy.barred import repeats_push
+from policy.push.candidates import PushCandidate, cells_with_start, object_centers, push_candidates, pushable_cells
+from policy.push.line import free_to_descend
+from robotcell.jobs.policy_api import PickAny, Uncover
 
 if TYPE_CHECKING:
-    from policy.network.inference import Inference
-    from policy.push.outcome import Foresight
-    from robotcell.perception.heightmap import Heightmap
+    from collections.abc import Callable
 
-# Of an object that stood alone, so many grasps are looked at, on cells so far apart; the best of those that have room
-# after a push count. One grasp may find room by an error of the played push, so many do not.
-_GRASPS = 80
-_APART = 2
-_COUNTED = 20
+    from policy.push.outcome import PushForwardModel
+    from robotcell.jobs.policy_api import Observation
+
+    # Q maps (K, H, W) of pushes at cells (K, H, W).
+    PushMaps = Callable[[npt.NDArray[np.bool_]], npt.NDArray[np.float32]]
+
+# What a push loses that may take an object out of the workspace, and one that may so lose what it is for.
+_LOSS, _WANTED_LOSS = 0.3, 1.0
+# Where no push near the targets has a place to start, the mask grows by the same again, up to so many times in all.
+_PUSHABLE_REACHES = 3
+# Pushes side by side that are predicted in each direction, and how far beside the centre of what they are to free they
+# are looked for. More and anywhere where a goal is hidden, since it need not lie in the middle of what hides it.
+_LANES, _LANES_TO_UNCOVER = 1, 4
+_OFF_CENTER_M = 0.016
 
 
-class _Alone(NamedTuple):
-    """An object that stands alone in its window: its best grasps, by cells of the window, and its own surface."""
+class PushValue(NamedTuple):
+    """A push and what the forward model says of it.
 
-    grasps: Cells
-    table: Table
-
-
-class Prospects:
-    """The grasps of the objects of one view, after pushes.
-
-    Args:
-        inference: the network.
-        foresight: of the view.
-        labels: (H, W) the object in each cell, 0 for none.
-        heightmap: what is seen.
-        jaw: of the gripper.
+    Attributes:
+        candidate: the push.
+        wanted: label of the object that it is to free; None where it is to uncover a goal.
+        around_m: (h, w) heights in the window of that object afterwards; None likewise.
+        gain: how much of that object's border it frees, -1..1; 0 likewise.
+        uncovered: share of the cells that hide a goal on which nothing stands afterwards; 0 where none is hidden.
+        loss: what may be lost, 0 for nothing.
+        moves: whether anything moves.
     """
 
-    def __init__(
-        self,
-        inference: Inference,
-        foresight: Foresight,
-        labels: npt.NDArray[np.integer],
-        heightmap: Heightmap,
-        jaw: Jaw,
-    ) -> None:
-        self._inference = inference
-        self._foresight = foresight
-        self._labels = labels
-        self._heightmap = heightmap
-        self._jaw = jaw
-        self._objects: dict[int, _Alone] = {}
+    candidate: PushCandidate
+    wanted: int | None
+    around_m: npt.NDArray[np.float32] | None
+    gain: float
+    uncovered: float
+    loss: float
+    moves: bool
 
-    def after(self, label: int, around: npt.NDArray[np.float32]) -> float:
-        """About the chance that an object can be grasped after a push.
 
-        The mean of the best grasps' Q, as if nothing stood around the object, times the room that the fingers find.
+def evaluate_pushes(
+    observation: Observation, model: PushForwardModel, push_m: float, push_maps: PushMaps
+) -> list[PushValue]:
+    """The pushes that are worth a look, none of which repeats a failure; empty where there is none.
 
-        Args:
-            label: of the object.
-            around: what the push makes of its window (`Foresight.around`).
-        """
-        grasps, alone = self._alone(label)
-        table = replace(alone, height_m=around, ceiling_m=around)
-        room = finger_room(table, grasps.row, grasps.col, grasps.rotation, self._jaw)
-        return float(np.sort(grasps.q * room)[-_COUNTED:].mean())
+    Args:
+        observation: what is seen, and the task.
+        model: of the same view.
+        push_m: length of a push.
+        push_maps: asked for Q maps; these choose among pushes in the same direction.
+    """
+    targets, task, labels = observation.targets(), observation.task, observation.labels
+    heightmap = observation.heightmap
+    workspace, height_m = heightmap.workspace, heightmap.closed_m
+    free = free_to_descend(height_m, workspace)
+    if isinstance(task, PickAny):
+        center, wanted = object_centers(labels), set()
+    else:
+        center = np.broadcast_to(np.argwhere(targets).mean(axis=0), (*targets.shape, 2))
+        wanted = set(np.unique(labels[targets]).tolist())
+    hiding = targets if isinstance(task, Uncover) else None
+    lanes, off_center_m = (_LANES, _OFF_CENTER_M) if hiding is None else (_LANES_TO_UNCOVER, math.inf)
+    mask = targets
+    for _ in range(_PUSHABLE_REACHES):
+        mask = pushable_cells(mask | targets, observation.objects, workspace.resolution_m)
+        possible = cells_with_start(mask, center, free, push_m, workspace.resolution_m, off_center_m)
+        if not possible.any():
+            continue
+        q = push_maps(possible)
+        found = []
+        for push in push_candidates(q, possible, center, height_m, free, push_m, workspace.resolution_m, lanes):
+            x, y = (np.array([v]) for v in workspace.position(push.line.row, push.line.col))
+            if not repeats_push(x, y, np.array([push.rotation]), observation.barred).any():
+                found.append(_evaluate(push, wanted or {int(labels[push.cell])}, hiding, model))
+        if found:
+            return found
+    return []
 
-    def _alone(self, label: int) -> _Alone:
-        """An object as if all others were gone."""
-        if label not in self._objects:
-            own, seen = self._labels == label, self._heightmap.color
-            bare = np.where(own, self._heightmap.filled(), np.float32(0))
-            table = self._labels == 0
-            color = np.median(seen[table], axis=0) if table.any() else np.zeros(3)
-            planes = encode(bare, np.where(own[..., None], seen, color.astype(np.uint8)))
-            q = self._inference.maps(planes, own, GRASP)
-            check_maps(q, own, "grasp")
-            best = best_cells(faded(q, own), thinned(own, _APART), _GRASPS)
-            window = self._foresight.window(label)
-            grasps = best._replace(row=best.row - window.top, col=best.col - window.left)
-            height_m = self._foresight.alone(label)
-            surface = Table(
-                height_m=height_m,
-                ceiling_m=height_m,
-                top_m=np.asarray(cv2.medianBlur(height_m, 5), np.float32),
-                owner=window.own.astype(np.int32),
-                pad=0,
-                resolution_m=self._heightmap.workspace.resolution_m,
-            )
-            self._objects[label] = _Alone(grasps, surface)
-        return self._objects[label]
+
+def _evaluate(
+    push: PushCandidate, wanted: set[int], hiding: npt.NDArray[np.bool_] | None, model: PushForwardModel
+) -> PushValue:
+    """Predict a push.
+
+    Args:
+        push: to be predicted.
+        wanted: labels of what it is for: one object, or those that may hide the goal.
+        hiding: (H, W) cells that hide the goal, None where it is seen.
+        model: of the view.
+    """
+    outcome = model.predict(push.line, push.rotation)
+    loss = _WANTED_LOSS if outcome.lost & wanted else _LOSS if outcome.lost else 0.0
+    if hiding is not None:
+        uncovered = model.uncovered_share(hiding, outcome)
+        return PushValue(push, None, None, 0.0, uncovered, loss, bool(outcome.moves))
+    label = max(wanted)
+    around_m = model.height_around(label, outcome)
+    return PushValue(push, label, around_m, model.border_gain(label, around_m), 0.0, loss, bool(outcome.moves))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.network.encoding import encode
+from policy.network.encoding import RESOLUTION_M, encode
 from policy.network.q_network import GRASP
 from policy.network.rotation import turn_matrix
 from policy.training.shard import unpack_height
@@ -18,13 +18,14 @@ from robotcell.motion.rotations import ROTATIONS
 if TYPE_CHECKING:
     from policy.training.replay import View
 
-# A push begins up to 90 mm behind its cell and ends up to 100 mm beyond it.
-CROP_CELLS = 112
+# Side of a crop: a push begins up to 90 mm behind its cell and ends up to 100 mm beyond it.
+CROP_M = 0.224
+CROP_CELLS = round(CROP_M / RESOLUTION_M)
 
 # Turned a little further than the action; a grasp or a push does not depend on a few degrees.
 _TURN_RAD = 0.06
 # Off the cell that was tried, likewise.
-_SHIFT_CELLS = 0.7
+_SHIFT_M = 0.0014
 # Light and white balance: gain of the whole picture, and of each colour.
 _BRIGHTNESS = (0.7, 1.3)
 _BALANCE = (0.85, 1.15)
@@ -51,7 +52,7 @@ def crop(
     if rng is not None:
         cos, sin = math.cos(angle := rng.normal(0, _TURN_RAD)), math.sin(angle)
         M = np.array([[cos, -sin], [sin, cos]]) @ M
-        M[:, 2] += rng.normal(0, _SHIFT_CELLS, 2)
+        M[:, 2] += rng.normal(0, _SHIFT_M / RESOLUTION_M, 2)
         if rng.random() < 0.5:
             M[1] *= -1
     M[:, 2] += middle

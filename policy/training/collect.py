@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from policy.grasp_room import Jaw, find_grasps, lay_table
-from policy.learned.selection import best_cells, faded, push_mask
-from policy.network.encoding import encode
+from policy.antipodal import antipodal_grasps
+from policy.finger_clearance import OpenGripper, pad_maps
+from policy.learned.selection import best_cells, smoothed
+from policy.network.encoding import RESOLUTION_M, encode
+from policy.push.candidates import pushable_cells
 from policy.push.line import push_line
-from policy.shadows import estimate_surface
+from policy.shadows import complete_heights
 from policy.training.environment import GRASP, PUSH, Outcome, PushGraspEnv, State, Trial
 from policy.training.shard import Shard, pack_height
 from robotcell.config import load_config
@@ -246,7 +248,7 @@ def _choices(
     for _ in range(settings.pushes):
         # Objects that others stand around are what pushes are for.
         target = state.labels == present[int(rng.choice(len(present), p=weights / weights.sum()))]
-        mask = push_mask(target, objects)
+        mask = pushable_cells(target, objects, RESOLUTION_M)
         explore = maps is None or rng.random() < collection.exploration
         if maps is not None and not explore:
             yield from _best_push(state, maps.push, mask, config, rng)
@@ -258,7 +260,7 @@ def _best_grasp(
     q: npt.NDArray[np.float32], mask: npt.NDArray[np.bool_], among: int, rng: np.random.Generator
 ) -> _Choice:
     """One of so many of the best."""
-    best = best_cells(faded(q, mask), mask, among)
+    best = best_cells(smoothed(q, mask, RESOLUTION_M), mask, among)
     i = int(rng.integers(len(best.q)))
     return _Choice(GRASP, int(best.rotation[i]), (int(best.row[i]), int(best.col[i])), greedy=among == 1)
 
@@ -293,8 +295,7 @@ def _random_push(
 
 
 def _has_start(state: State, cell: tuple[int, int], rotation: int, config: CellConfig) -> bool:
-    resolution, length = config.workspace.resolution_m, config.motion.push_m
-    return push_line(state.height_m, state.free, cell, rotation, length, resolution) is not None
+    return push_line(state.height_m, state.free, cell, rotation, config.motion.push_m, RESOLUTION_M) is not None
 
 
 def _random_cell(mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> tuple[int, int]:
@@ -305,12 +306,10 @@ def _random_cell(mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> tuple
 
 def _geometric(state: State, config: CellConfig, rng: np.random.Generator) -> list[_Choice]:
     """Grasps that look possible, the better ones more often."""
-    surface = estimate_surface(state.heightmap, config.camera.pose()[:3, 3], config.table.height_m)
-    jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
-    resolution = config.workspace.resolution_m
-    found = find_grasps(
-        lay_table(surface, state.labels.astype(np.int32), resolution, jaw.opening_m), state.labels > 0, jaw
-    )
+    heights = complete_heights(state.heightmap, config.camera.pose()[:3, 3], config.table.height_m)
+    gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+    maps = pad_maps(heights, state.labels.astype(np.int32), RESOLUTION_M, gripper.opening_m)
+    found = antipodal_grasps(maps, state.labels > 0, gripper)
     likely = np.flatnonzero(found.score > 0)
     if not len(likely):
         return []

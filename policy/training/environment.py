@@ -18,9 +18,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from policy.learned.selection import surface_at
-from policy.network.encoding import CHANNELS, encode
+from policy.map_grid import workspace_at
+from policy.network.encoding import CHANNELS, RESOLUTION_M, encode
 from policy.network.q_network import GRASP, PUSH
-from policy.push.border import border_occupancy
+from policy.push.border import USEFUL_GAIN, border_occupancy
 from policy.push.line import PushLine, free_to_descend, push_line
 from policy.training.scenes import training_scene
 from robotcell.config import CameraMount, CellConfig
@@ -29,7 +30,7 @@ from robotcell.geometry.transforms import look_at, make_transform
 from robotcell.motion.executor import Ending
 from robotcell.motion.grasp import grasp_height
 from robotcell.motion.push import push_height
-from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.rotations import GRASP_ROTATIONS, ROTATIONS, rotation_angle_rad
 from robotcell.motion.tool import near_height
 from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.heightmap import Heightmap, build_heightmap
@@ -44,8 +45,7 @@ if TYPE_CHECKING:
 
     from robotcell.geometry.transforms import Array
 
-# Paper, stage II: a push that gains more than tau of the border earns the reward.
-GAIN_TAU = 0.1
+# Paper, stage II: the reward of a push that frees more than tau of the border (`policy.push.border.USEFUL_GAIN`).
 PUSH_REWARD = 0.5
 # Stage I: a push scatters when the objects' borders are freed by this much on average over all that moved.
 _SCATTER = 0.02
@@ -122,13 +122,14 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
     `aside` give what a learner may ask of a simulator beyond that: other actions in the same state.
 
     Args:
-        config: of the cell.
+        config: of the cell; its workspace is seen at the resolution of the network.
         stage: 1, goal-agnostic, or 2, goal-oriented.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - the interface's own declaration
 
     def __init__(self, config: CellConfig, stage: int) -> None:
+        config = config.model_copy(update={"workspace": workspace_at(config.workspace, RESOLUTION_M)})
         rows, cols = config.workspace.shape
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (CHANNELS, rows, cols), np.float32)
         self.action_space = gymnasium.spaces.MultiDiscrete([2, ROTATIONS, rows, cols])
@@ -276,18 +277,18 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
             height_m=height_m,
             labels=labels,
             free=free_to_descend(height_m, config.workspace),
-            occupied={int(i): border_occupancy(labels == i, height_m) for i in np.unique(labels) if i},
+            occupied={int(i): border_occupancy(labels == i, height_m, RESOLUTION_M) for i in np.unique(labels) if i},
         )
 
     def _run(self, primitive: int, rotation: int, cell: Cell) -> Trial:
-        return self._grasp(rotation % (ROTATIONS // 2), cell) if primitive == GRASP else self._push(rotation, cell)
+        return self._grasp(rotation % GRASP_ROTATIONS, cell) if primitive == GRASP else self._push(rotation, cell)
 
     def _grasp(self, rotation: int, cell: Cell) -> Trial:
         gripper, state, config = self._need(), self.state, self._config
         table = config.table.height_m
         x, y = config.workspace.position(*cell)
-        theta = 2 * np.pi * rotation / ROTATIONS
-        tcp_z = table + grasp_height(surface_at(state.height_m, cell), config)
+        theta = rotation_angle_rad(rotation)
+        tcp_z = table + grasp_height(surface_at(state.height_m, cell, RESOLUTION_M), config)
         near_z = near_height(state.heightmap, x, y, theta, config.gripper.preshape_m, tcp_z, config)
         attempt = gripper.grasp(x, y, theta, near_z, tcp_z)
         target = int(state.labels[cell])
@@ -303,14 +304,14 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         table, workspace = config.table.height_m, config.workspace
         target = int(state.labels[cell])
         nothing = ((cell, target, (0.0, 0.0), False),)
-        line = push_line(state.height_m, state.free, cell, rotation, config.motion.push_m, workspace.resolution_m)
+        line = push_line(state.height_m, state.free, cell, rotation, config.motion.push_m, RESOLUTION_M)
         if line is None:
             return Trial(Outcome.NO_START, (), nothing)
         x, y = workspace.position(line.row, line.col)
-        theta = 2 * np.pi * rotation / ROTATIONS
+        theta = rotation_angle_rad(rotation)
         tcp_z = table + push_height(line.top_m, config)
         near_z = near_height(state.heightmap, x, y, theta, 0.0, tcp_z, config)
-        length = (len(line.cells) - 1) * workspace.resolution_m
+        length = (len(line.cells) - 1) * RESOLUTION_M
         before = gripper.save()
         attempt = gripper.push((x, y), theta, length, near_z, tcp_z)
         if attempt.ending is Ending.CONTACT:
@@ -340,7 +341,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         for target in dict.fromkeys(int(v) for v in on_way[:reach] if v):
             own = np.flatnonzero(on_way[:reach] == target)
             at = line.cells[own[len(own) // 2]]
-            reward = PUSH_REWARD if gains.get(target, 0.0) > GAIN_TAU else 0.0
+            reward = PUSH_REWARD if gains.get(target, 0.0) > USEFUL_GAIN else 0.0
             # The middle of what the push meets, and for the chosen object the cell it was chosen for.
             places = {(int(at[0]), int(at[1]))} | ({cell} if target == int(state.labels[cell]) else set())
             rows += [(place, target, (scatter, reward), target in gains) for place in sorted(places)]

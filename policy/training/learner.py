@@ -13,11 +13,12 @@ import torch
 from scipy.stats import rankdata
 from torch.nn import functional
 
-from policy.learned.selection import best_cells, faded
-from policy.network.encoding import encode
+from policy.learned.selection import best_cells, smoothed
+from policy.network.encoding import RESOLUTION_M, encode
+from policy.network.inference import MARGIN_M
 from policy.network.precision import autocast
 from policy.network.q_network import GRASP, PUSH
-from policy.network.rotation import MARGIN, Copies
+from policy.network.rotation import Copies
 from policy.training.augment import crop
 from policy.training.shard import unpack_height
 from robotcell.motion.rotations import GRASP_ROTATIONS
@@ -168,14 +169,14 @@ class Learner:
         cells = view.labels == goal
         if not cells.any():
             return 0.0
-        copies = Copies.around(cells, range(GRASP_ROTATIONS), MARGIN)
+        copies = Copies.around(cells, range(GRASP_ROTATIONS), round(MARGIN_M / RESOLUTION_M))
         turned = copies.turn(encode(unpack_height(view.height), view.color))
         x = torch.from_numpy(turned).to(self.device)
         with autocast(self.device):
             q = self.online(x)[:, GRASP].float().cpu().numpy()
         maps = np.zeros((GRASP_ROTATIONS, *cells.shape), np.float32)
         maps[:, copies.rows, copies.cols] = copies.values(q)
-        best = best_cells(faded(maps, cells), cells, 1)
+        best = best_cells(smoothed(maps, cells, RESOLUTION_M), cells, 1)
         rotation, row, col = int(best.rotation[0]), int(best.row[0]), int(best.col[0])
         chosen = crop(view, GRASP, (row, col), rotation, None)[None]
         return float(self._at_middle(self.target, chosen, np.array([GRASP]))[0])

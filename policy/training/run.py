@@ -34,7 +34,7 @@ from policy.training.learner import Learner
 from policy.training.replay import Replay
 from policy.training.shard import Shard
 from robotcell.errors import ConfigError
-from robotcell.io.atomic_file import replaced, write_whole
+from robotcell.io.atomic_file import make_folder, replaced, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -114,6 +114,7 @@ def prepare(
 
     Raises:
         ConfigError: the stage has been started (or has not, with `resume`), or has to wait for stage 1.
+        StorageError: its folder or file cannot be written.
     """
     folder = run / f"stage{stage}"
     written = folder / "train.toml"
@@ -135,10 +136,7 @@ def prepare(
         raise ConfigError("there is no stage 1 in a single-stage training; use --stage 2")
     if stage == 2 and not config.single_stage:
         _check_stage1(run)
-    try:
-        (folder / "shards").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made ({error.strerror}); choose another --run") from error
+    make_folder(folder / "shards")
     with replaced(written) as part:
         save_train_config(config, part)
     return config

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-import policy.network.inference
 from policy.network.encoding import encode
 from policy.network.inference import Inference
 from policy.network.q_network import GRASP, PUSH
@@ -18,7 +17,7 @@ from policy.network.weights import load_named
 from policy.training.learner import auc
 from policy.training.shard import Shard, unpack_height
 
-MARGINS = (24, 32, 40, 56)
+MARGINS_M = (0.048, 0.064, 0.080, 0.112)
 SHARDS = 16
 ATTEMPTS = 40
 # Reward of stage II from which on an attempt counts as a success: a grasp gives 1, a push that frees its object 0.5.
@@ -30,10 +29,11 @@ def main() -> None:
     paths = sorted((Path(sys.argv[1]) / "shards").glob("*.npz"))
     if not paths:
         sys.exit(f"{sys.argv[1]}/shards holds no shard: name a stage of a training run")
-    network, rng = Inference(load_named("learned")[0]), np.random.default_rng(0)
+    weights, rng = load_named("learned")[0], np.random.default_rng(0)
+    networks = {margin_m: Inference(weights, margin_m) for margin_m in MARGINS_M}
     for name, primitive in (("grasps", GRASP), ("pushes", PUSH)):
         rewarded: list[bool] = []
-        values: dict[int, list[float]] = {margin: [] for margin in MARGINS}
+        values: dict[float, list[float]] = {margin_m: [] for margin_m in MARGINS_M}
         for path in track(paths[:: max(1, len(paths) // SHARDS)], name):
             shard = Shard.load(path)
             for i in rng.permutation(np.flatnonzero(shard.primitive == primitive))[:ATTEMPTS]:
@@ -43,11 +43,11 @@ def main() -> None:
                     continue
                 planes = encode(unpack_height(shard.height[state]), shard.color[state])
                 rewarded.append(bool(shard.reward[i, 1] > SUCCESS))
-                for margin, found in values.items():
-                    policy.network.inference.MARGIN = margin
-                    found.append(float(network.maps(planes, target, primitive)[shard.rotation[i], row, col]))
+                for margin_m, found in values.items():
+                    found.append(float(networks[margin_m].maps(planes, target, primitive)[shard.rotation[i], row, col]))
         areas = ", ".join(
-            f"{margin} cells {auc(np.array(found), np.array(rewarded)):.3f}" for margin, found in values.items()
+            f"{1000 * margin_m:g} mm {auc(np.array(found), np.array(rewarded)):.3f}"
+            for margin_m, found in values.items()
         )
         sys.stdout.write(f"{name}: {len(rewarded)} attempts, {areas}\n")
 

@@ -1,8 +1,8 @@
-"""Which pushes are worth playing ahead: `python -m tests.benchmarks.push_proposals`.
+"""Which pushes are worth predicting: `python -m tests.benchmarks.push_proposals`.
 
 Scenes of training kinds and unseen seeds, where the goal is the object with the fullest border, and the ten of the
-suite `challenging`. Pushes are chosen in several ways and played; prints how many they are, and what the best of them
-promises, on average.
+suite `challenging`. Pushes are chosen in several ways and predicted; prints how many they are, and what the best of
+them promises, on average.
 """
 
 import math
@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 from rich.progress import track
 
-from policy.grasp_room import Jaw
-from policy.learned.selection import possible_pushes, push_mask, pushes
+from policy.finger_clearance import OpenGripper
+from policy.learned.graspability import Graspability
 from policy.network.encoding import encode
 from policy.network.inference import Inference
 from policy.network.q_network import PUSH
 from policy.network.weights import load_named
+from policy.push.candidates import cells_with_start, push_candidates, pushable_cells
 from policy.push.line import free_to_descend, push_line
-from policy.push.outcome import Foresight
-from policy.push.value import Prospects
+from policy.push.outcome import PushForwardModel
 from policy.training.environment import PushGraspEnv
 from robotcell.cell import open_cell
 from robotcell.config import load_config
@@ -41,7 +41,7 @@ COUNT = (4, 13)
 
 CONFIG = load_config()
 RESOLUTION_M, PUSH_M = CONFIG.workspace.resolution_m, CONFIG.motion.push_m
-JAW = Jaw(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
+GRIPPER = OpenGripper(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
 
 
 class View(NamedTuple):
@@ -82,18 +82,18 @@ def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict
     heightmap, labels, goal = view
     height_m = heightmap.closed_m
     targets = labels == goal
-    mask = push_mask(targets, labels > 0)
+    mask = pushable_cells(targets, labels > 0, RESOLUTION_M)
     free = free_to_descend(height_m, CONFIG.workspace)
     q = inference.maps(encode(height_m, heightmap.color), mask, PUSH)
-    foresight = Foresight(labels, heightmap)
-    prospects = Prospects(inference, foresight, labels, heightmap, JAW)
+    model = PushForwardModel(labels, heightmap)
+    graspability = Graspability(inference, model, labels, heightmap, GRIPPER)
 
     def promise(line, rotation):
-        return prospects.after(goal, foresight.around(goal, foresight.play(line, rotation)))
+        return graspability.after(goal, model.height_around(goal, model.predict(line, rotation)))
 
-    def proposed(middle, beside):
-        possible = possible_pushes(mask, middle, free, PUSH_M, RESOLUTION_M, beside)
-        chosen = pushes(q, possible, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
+    def proposed(middle, off_center_m):
+        possible = cells_with_start(mask, middle, free, PUSH_M, RESOLUTION_M, off_center_m)
+        chosen = push_candidates(q, possible, middle, height_m, free, PUSH_M, RESOLUTION_M, lanes=1)
         return [promise(push.line, push.rotation) for push in chosen]
 
     cells = np.argwhere(mask)
@@ -113,7 +113,7 @@ def promises(view: View, inference: Inference, rng: np.random.Generator) -> dict
         "at random": drawn[:ROTATIONS],
         "the best Q of each rotation": proposed(itself, math.inf),
         "the same, less beside the middle": proposed(middle, math.inf),
-        "the same, near the middle": proposed(middle, 8),
+        "the same, near the middle": proposed(middle, 0.016),
         "many at random": drawn,
     }
 

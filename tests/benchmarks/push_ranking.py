@@ -13,16 +13,16 @@ from collections import defaultdict
 import numpy as np
 from rich.progress import track
 
-from policy.grasp_room import Jaw
+from policy.finger_clearance import OpenGripper
+from policy.learned.graspability import Graspability
 from policy.learned.policy import LearnedPolicy
-from policy.learned.selection import push_mask
 from policy.network.encoding import encode
 from policy.network.inference import Inference
 from policy.network.q_network import GRASP, PUSH
 from policy.network.weights import load_named
+from policy.push.candidates import pushable_cells
 from policy.push.line import push_line
-from policy.push.outcome import Foresight
-from policy.push.value import Prospects
+from policy.push.outcome import PushForwardModel
 from policy.training.environment import Outcome, PushGraspEnv
 from policy.training.learner import auc
 from robotcell.config import load_config
@@ -40,7 +40,7 @@ SEEN_CELLS = 60
 
 CONFIG = load_config()
 RESOLUTION_M = CONFIG.workspace.resolution_m
-JAW = Jaw(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
+GRIPPER = OpenGripper(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
 
 
 class Ranking:
@@ -76,10 +76,10 @@ class Ranking:
         """Scores of random pushes by their name, and whether the goal could be grasped after each."""
         state = env.state
         labels, height_m, color = state.labels.astype(np.int32), state.height_m, state.heightmap.color
-        mask = push_mask(labels == goal, labels > 0)
+        mask = pushable_cells(labels == goal, labels > 0, RESOLUTION_M)
         q = self.inference.maps(encode(height_m, color), mask, PUSH)
-        foresight = Foresight(labels, state.heightmap)
-        prospects = Prospects(self.inference, foresight, labels, state.heightmap, JAW)
+        model = PushForwardModel(labels, state.heightmap)
+        graspability = Graspability(self.inference, model, labels, state.heightmap, GRIPPER)
         cells = rng.permutation(np.argwhere(mask))
         scores, graspable = defaultdict(list), []
         for row, col in cells.tolist():
@@ -91,10 +91,10 @@ class Ranking:
                 if env.advance(PUSH, rotation, (row, col)).outcome is not Outcome.PUSHED:
                     continue
                 graspable.append(self.grasp(env, goal))
-            around = foresight.around(goal, foresight.play(line, rotation))
+            around_m = model.height_around(goal, model.predict(line, rotation))
             scores["Q"].append(float(q[rotation, row, col]))
-            scores["border freed"].append(foresight.freed(goal, around))
-            scores["promise"].append(prospects.after(goal, around))
+            scores["border freed"].append(model.border_gain(goal, around_m))
+            scores["promise"].append(graspability.after(goal, around_m))
             if len(graspable) == PUSHES:
                 break
         return scores, graspable

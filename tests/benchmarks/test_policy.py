@@ -14,16 +14,16 @@ import pytest
 import torch
 
 from policy import make_policy
-from policy.grasp_room import Jaw
-from policy.learned.selection import possible_pushes, push_mask
+from policy.finger_clearance import OpenGripper
+from policy.learned.graspability import Graspability
 from policy.network.encoding import encode
 from policy.network.inference import Inference
 from policy.network.q_network import GRASP, PUSH
 from policy.network.registry import make_network
 from policy.network.weights import load_named
+from policy.push.candidates import cells_with_start, pushable_cells
 from policy.push.line import free_to_descend, push_line
-from policy.push.outcome import Foresight
-from policy.push.value import Prospects
+from policy.push.outcome import PushForwardModel
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.errors import NoTarget
@@ -90,30 +90,30 @@ def test_push_maps(benchmark, config, heightmap, inference):
     """Near the middle of the goal, as the policy asks for them."""
     planes, observation = encode(heightmap.closed_m, heightmap.color), observe(heightmap)
     free = free_to_descend(heightmap.closed_m, config.workspace)
-    mask = push_mask(observation.targets(), observation.objects)
+    mask = pushable_cells(observation.targets(), observation.objects, config.workspace.resolution_m)
     middle = np.broadcast_to(np.argwhere(observation.targets()).mean(axis=0), (*mask.shape, 2))
-    possible = possible_pushes(mask, middle, free, config.motion.push_m, config.workspace.resolution_m, beside=8)
+    possible = cells_with_start(mask, middle, free, config.motion.push_m, config.workspace.resolution_m, 0.016)
     assert np.isfinite(benchmark(inference.maps, planes, possible, PUSH)[possible]).all()
 
 
-def test_play(benchmark, config, heightmap, inference):
+def test_predict(benchmark, config, heightmap, inference):
     """One push, and what it promises for the goal."""
     observation = observe(heightmap)
     goal, height_m = int(observation.labels[observation.targets()].max()), heightmap.closed_m
     resolution_m = config.workspace.resolution_m
     free = free_to_descend(height_m, config.workspace)
-    cells = np.argwhere(push_mask(observation.targets(), observation.objects)).tolist()
+    cells = np.argwhere(pushable_cells(observation.targets(), observation.objects, resolution_m)).tolist()
     lines = (push_line(height_m, free, cell, 0, config.motion.push_m, resolution_m) for cell in cells)
     line = next(line for line in lines if line is not None)
-    foresight = Foresight(observation.labels, heightmap)
-    jaw = Jaw(config.gripper.preshape_m, config.gripper.tip_clearance_m)
-    prospects = Prospects(inference, foresight, observation.labels, heightmap, jaw)
+    model = PushForwardModel(observation.labels, heightmap)
+    gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+    graspability = Graspability(inference, model, observation.labels, heightmap, gripper)
 
-    def play():
-        around = foresight.around(goal, foresight.play(line, 0))
-        return foresight.freed(goal, around), prospects.after(goal, around)
+    def predict():
+        around_m = model.height_around(goal, model.predict(line, 0))
+        return model.border_gain(goal, around_m), graspability.after(goal, around_m)
 
-    assert np.isfinite(benchmark(play)).all()
+    assert np.isfinite(benchmark(predict)).all()
 
 
 # The goal of this frame needs a push; where none is allowed, the decision costs what a clear grasp costs.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from policy import make_policy
-from policy.shadows import estimate_surface
+from policy.shadows import complete_heights
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.jobs.policy_api import Observation, PickAny, PickGoal
@@ -60,10 +60,10 @@ def test_segment(benchmark, look):
 
 
 @RESOLUTIONS
-def test_surface(benchmark, look):
+def test_complete_heights(benchmark, look):
     config, _ = look
-    surface = benchmark(estimate_surface, heightmap_of(look), config.camera.pose()[:3, 3], config.table.height_m)
-    assert np.isfinite(surface.height_m).all()
+    heights = benchmark(complete_heights, heightmap_of(look), config.camera.pose()[:3, 3], config.table.height_m)
+    assert np.isfinite(heights.height_m).all()
 
 
 @RESOLUTIONS

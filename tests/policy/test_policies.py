@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from policy import make_policy
-from robotcell.config import load_config
+from robotcell.config import Workspace, load_config
 from robotcell.errors import ConfigError
 from robotcell.jobs.policy_api import Observation, PickAny
 from robotcell.motion.grasp import Grasp
@@ -23,6 +23,29 @@ def test_every_policy_comes_with_what_it_needs(name):
     assert policy.name == name
     assert isinstance(action, Grasp)
     assert labels[policy.workspace.cell(action.x, action.y)]
+
+
+@pytest.mark.parametrize("name", ["learned", "grasp-only", "single-stage", "heuristic"])
+@pytest.mark.parametrize("resolution_m", [0.001, 0.005])
+def test_a_policy_decides_on_the_map_that_it_declares_whatever_the_cell_says(name, resolution_m):
+    cell = Workspace(x=(-0.65, -0.35), y=(-0.1, 0.1), resolution_m=resolution_m)
+    policy = make_policy(name, CONFIG.model_copy(update={"workspace": cell}))
+    workspace = policy.workspace
+    assert (workspace.x, workspace.y, workspace.resolution_m) == (cell.x, cell.y, 0.002)
+    heights = np.zeros(workspace.shape, np.float32)
+    heights[40:65, 60:85] = 0.05
+    labels = (heights > 0).astype(np.int32)
+    action = policy.decide(Observation(heightmap(heights, workspace), labels, PickAny(), may_push=False))
+    assert labels[workspace.cell(action.x, action.y)]
+    shown = heightmap(np.zeros(cell.shape, np.float32), cell)
+    with pytest.raises(ConfigError, match=f"{name!r} works on cells of 2 mm and is shown a map of"):
+        policy.decide(Observation(shown, np.ones(cell.shape, np.int32), PickAny()))
+
+
+def test_the_random_policy_works_at_any_resolution():
+    workspace = Workspace(resolution_m=0.007)
+    policy = make_policy("random", CONFIG.model_copy(update={"workspace": workspace}))
+    assert policy.workspace == workspace
 
 
 def test_an_unknown_policy_lists_those_that_exist():

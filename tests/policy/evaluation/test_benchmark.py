@@ -6,7 +6,7 @@ import pytest
 
 from policy.evaluation.benchmark import finished, load, plan, run, start, write_json
 from robotcell.config import load_config
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, StorageError
 from tests.policy.evaluation.examples import ORIGIN, settings
 from tests.policy.evaluation.test_suites import toml
 
@@ -96,5 +96,5 @@ def test_json_that_cannot_be_written_is_refused(tmp_path):
     path = tmp_path / "out.json"
     write_json(path, settings(), ORIGIN, [])
     assert json.loads(path.read_text())["version"] == 1
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(StorageError, match="cannot be written"):
         write_json(tmp_path / "none" / "out.json", settings(), ORIGIN, [])

@@ -104,17 +104,6 @@ def test_a_lone_cube_is_grasped_square_and_in_the_middle(x, y, angle, height):
     assert action.surface_m == pytest.approx(height, abs=1e-3)
 
 
-@pytest.mark.parametrize("resolution_m", [0.001, 0.004, 0.007])
-def test_cells_of_any_size_will_do(resolution_m):
-    workspace = Workspace(x=(-0.65, -0.35), y=(-0.1, 0.1), resolution_m=resolution_m)
-    scene = Scene(workspace)
-    goal = scene.box((-0.52, 0.02), angle=0.4)
-    scene.box((-0.45, -0.04), angle=0.1, color="blue")
-    action = make_policy("heuristic", CellConfig(workspace=workspace)).decide(scene.look(goal))
-    assert isinstance(action, Grasp)
-    assert math.hypot(action.x + 0.52, action.y - 0.02) < 0.015
-
-
 @given(angle=st.floats(0, math.pi))
 @settings(max_examples=20)
 def test_a_plank_is_grasped_across(angle):

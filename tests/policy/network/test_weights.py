@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from policy.network import weights
 from policy.network.registry import make_network
 from policy.network.weights import NAMED, load_named, load_weights, save_weights
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, StorageError
 
 CARD = {"training": json.dumps({"steps": 5000, "lr": 1e-3}), "evaluation": json.dumps({"grasp": 0.94})}
 
@@ -101,7 +101,9 @@ def test_a_large_network_is_rounded_to_half_and_loaded_as_float32(tmp_path):
 @settings(max_examples=15)
 @given(
     card=st.dictionaries(
-        st.text(min_size=1).filter(lambda name: name not in {"format", "architecture", "sha256"}), st.text(), max_size=4
+        st.text(min_size=1).filter(lambda name: name not in {"format", "architecture", "resolution_m", "sha256"}),
+        st.text(),
+        max_size=4,
     )
 )
 def test_a_card_may_say_anything(scratch, card):
@@ -135,6 +137,7 @@ def test_a_changed_card_is_refused(good, scratch):
 
 
 def test_another_format_is_refused(good, scratch):
+    refused(rewrite(good, scratch, resolution_m="0.001"), "trained on cells of 0.001 m")
     refused(rewrite(good, scratch, format="2"), "of format '2'; this program reads format '1'")
 
 
@@ -199,7 +202,7 @@ def test_a_network_is_only_saved_as_what_it_is(tmp_path):
         save_weights(path, trained(), "deep", {})
     with pytest.raises(ConfigError, match="needs the entries format, sha256; rename"):
         save_weights(path, trained(), "fast", {"sha256": "0", "format": "mine"})
-    with pytest.raises(ConfigError, match=r"cannot be written \(No such file or directory\); choose another folder"):
+    with pytest.raises(StorageError, match=r"cannot be written: No such file or directory; check the folder"):
         save_weights(tmp_path / "nowhere" / "weights.safetensors", trained(), "fast", {})
     assert list(tmp_path.iterdir()) == []
 

@@ -1,4 +1,4 @@
-"""Pushes played ahead."""
+"""The forward model of pushes."""
 
 import math
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from policy.push.line import free_to_descend, push_line
-from policy.push.outcome import Foresight
+from policy.push.outcome import PushForwardModel
 from robotcell.config import CellConfig
 from tests.robotcell.maps import heightmap
 
@@ -31,18 +31,18 @@ class Table:
         free = free_to_descend(self.height_m, CONFIG.workspace)
         line = push_line(self.height_m, free, cell, rotation, PUSH_M, RESOLUTION_M)
         assert line is not None
-        foresight = Foresight(self.labels, heightmap(self.height_m))
-        return foresight, line, foresight.play(line, rotation)
+        model = PushForwardModel(self.labels, heightmap(self.height_m))
+        return model, line, model.predict(line, rotation)
 
 
-def freed(foresight, label, played):
-    return foresight.freed(label, foresight.around(label, played))
+def border_gain(model, label, outcome):
+    return model.border_gain(label, model.height_around(label, outcome))
 
 
-def shift(played, label, cell):
+def shift(outcome, label, cell):
     """How far the middle of an object goes [m], along x and y."""
     before = (np.array(cell[::-1]) + 0.5) * RESOLUTION_M
-    move = played.moves[label]
+    move = outcome.moves[label]
     return move[:2, :2] @ before + move[:2, 2] - before
 
 
@@ -50,44 +50,44 @@ def shift(played, label, cell):
 @given(rotation=st.integers(0, 15))
 def test_a_block_goes_with_the_fingers_and_its_neighbours_stay(rotation):
     table = Table((100, 100, 25, 25), (20, 20, 25, 25))
-    _, line, played = table.push((112, 112), rotation)
-    assert set(played.moves) == {1}
+    _, line, outcome = table.push((112, 112), rotation)
+    assert set(outcome.moves) == {1}
     theta = 2 * math.pi * rotation / 16
-    way = shift(played, 1, (112, 112))
+    way = shift(outcome, 1, (112, 112))
     gap = np.hypot(112 - line.row, 112 - line.col) * RESOLUTION_M
     # From where the fingers meet it, which are 10 mm long on that side; at a corner it also turns.
     expected = PUSH_M - (gap - 0.010 - 0.025)
     assert way @ (math.cos(theta), math.sin(theta)) == pytest.approx(expected, abs=0.012)
     assert abs(way @ (-math.sin(theta), math.cos(theta))) < 0.02
-    assert not played.lost
+    assert not outcome.lost
 
 
 def test_a_push_beside_the_middle_turns_the_block():
-    _, _, played = Table((100, 100, 25, 25)).push((124, 112), 0)
-    angle = math.atan2(played.moves[1][1, 0], played.moves[1][0, 0])
+    _, _, outcome = Table((100, 100, 25, 25)).push((124, 112), 0)
+    angle = math.atan2(outcome.moves[1][1, 0], outcome.moves[1][0, 0])
     # Pushed at larger y, towards +x: clockwise in a frame whose z is up.
     assert angle < -0.2
 
 
 def test_what_is_met_on_the_way_is_pushed_on():
-    _, _, played = Table((100, 60, 25, 25), (100, 95, 25, 25)).push((112, 72), 0)
-    assert set(played.moves) == {1, 2}
-    first, second = shift(played, 1, (112, 72)), shift(played, 2, (112, 107))
+    _, _, outcome = Table((100, 60, 25, 25), (100, 95, 25, 25)).push((112, 72), 0)
+    assert set(outcome.moves) == {1, 2}
+    first, second = shift(outcome, 1, (112, 72)), shift(outcome, 2, (112, 107))
     assert 0 < second[0] < first[0]
 
 
 def test_fingers_pass_over_what_is_lower_than_their_tips():
     # The low one lies beside the way of the high one and in that of the fingers.
     table = Table((92, 60, 20, 25, 0.10), (112, 60, 25, 25, 0.03))
-    _, line, played = table.push((111, 72), 0)
+    _, line, outcome = table.push((111, 72), 0)
     assert line.top_m == pytest.approx(0.10)
-    assert played.moves[1][0, 2] > 0.05
-    assert 2 not in played.moves or abs(shift(played, 2, (124, 72))[0]) < 0.02
+    assert outcome.moves[1][0, 2] > 0.05
+    assert 2 not in outcome.moves or abs(shift(outcome, 2, (124, 72))[0]) < 0.02
 
 
 def test_what_is_lower_than_the_tips_is_pushed_by_what_they_push():
-    _, _, played = Table((100, 60, 25, 25, 0.10), (100, 95, 25, 25, 0.03)).push((112, 72), 0)
-    first, second = shift(played, 1, (112, 72)), shift(played, 2, (112, 107))
+    _, _, outcome = Table((100, 60, 25, 25, 0.10), (100, 95, 25, 25, 0.03)).push((112, 72), 0)
+    first, second = shift(outcome, 1, (112, 72)), shift(outcome, 2, (112, 107))
     assert 0.02 < second[0] < first[0]
 
 
@@ -102,8 +102,8 @@ def test_specks_in_the_shadow_behind_an_object_are_not_pushed():
 
 
 def test_what_is_narrow_is_an_obstacle_all_the_same():
-    _, _, played = Table((100, 60, 25, 25), (90, 95, 45, 2)).push((112, 72), 0)
-    assert set(played.moves) == {1, 2}
+    _, _, outcome = Table((100, 60, 25, 25), (90, 95, 45, 2)).push((112, 72), 0)
+    assert set(outcome.moves) == {1, 2}
 
 
 def test_what_stands_in_the_mouth_of_another_is_not_driven_out():
@@ -120,29 +120,29 @@ def test_what_stands_in_the_mouth_of_another_is_not_driven_out():
 
 def test_a_push_away_from_a_neighbour_frees_the_border():
     table = Table((100, 100, 25, 25), (100, 126, 25, 25))
-    foresight, _, away = table.push((112, 112), 4)
-    assert freed(foresight, 1, away) > 0.15
-    assert freed(foresight, 2, away) > 0.15
+    model, _, away = table.push((112, 112), 4)
+    assert border_gain(model, 1, away) > 0.15
+    assert border_gain(model, 2, away) > 0.15
     _, _, together = table.push((112, 112), 0)
-    assert freed(foresight, 1, together) == pytest.approx(0, abs=0.05)
+    assert border_gain(model, 1, together) == pytest.approx(0, abs=0.05)
 
 
 def test_an_object_without_neighbours_has_nothing_to_be_freed_of():
-    foresight, _, played = Table((100, 100, 25, 25)).push((112, 112), 3)
-    assert freed(foresight, 1, played) == 0.0
+    model, _, outcome = Table((100, 100, 25, 25)).push((112, 112), 3)
+    assert border_gain(model, 1, outcome) == 0.0
 
 
 def test_cells_are_uncovered_by_what_leaves_them():
     table = Table((100, 60, 25, 25), (100, 90, 25, 25))
     first, second = table.labels == 1, table.labels == 2
-    foresight, _, played = table.push((112, 72), 4)
-    assert set(played.moves) == {1}
-    assert foresight.uncovered(first, played) > 0.9
-    assert foresight.uncovered(second, played) == 0.0
+    model, _, outcome = table.push((112, 72), 4)
+    assert set(outcome.moves) == {1}
+    assert model.uncovered_share(first, outcome) > 0.9
+    assert model.uncovered_share(second, outcome) == 0.0
     # The first comes to stand where the second stood.
-    foresight, _, along = table.push((112, 72), 0)
-    assert foresight.uncovered(first, along) > 0.9
-    assert 0.1 < foresight.uncovered(second, along) < 0.9
+    model, _, along = table.push((112, 72), 0)
+    assert model.uncovered_share(first, along) > 0.9
+    assert 0.1 < model.uncovered_share(second, along) < 0.9
 
 
 def test_what_ends_at_the_rim_may_be_lost():
@@ -153,14 +153,14 @@ def test_what_ends_at_the_rim_may_be_lost():
 
 def test_the_same_push_gives_the_same():
     table = Table((100, 100, 25, 25), (90, 127, 25, 25), (126, 100, 20, 40))
-    plays = [table.push((105, 105), 1)[2].moves for _ in range(2)]
-    assert plays[0].keys() == plays[1].keys()
-    assert all(np.array_equal(plays[0][i], plays[1][i]) for i in plays[0])
+    outcomes = [table.push((105, 105), 1)[2].moves for _ in range(2)]
+    assert outcomes[0].keys() == outcomes[1].keys()
+    assert all(np.array_equal(outcomes[0][i], outcomes[1][i]) for i in outcomes[0])
 
 
 def test_holes_and_specks_are_no_obstacles():
     table = Table((100, 100, 25, 25))
     table.height_m[60:70, 60:70] = np.nan
     table.labels[112, 150:153] = 9
-    _, _, played = table.push((112, 112), 0)
-    assert set(played.moves) == {1}
+    _, _, outcome = table.push((112, 112), 0)
+    assert set(outcome.moves) == {1}

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from policy.push.physics import Prism, SlidingTable
+from policy.push.physics import PlanarPhysics, Prism
 
 RESOLUTION_M = 0.002
 LENGTH_M = 0.10
@@ -28,7 +28,7 @@ def area_m2(of):
 
 
 def table():
-    return SlidingTable({1: prism((60, 60, 25, 25)), 2: prism((60, 90, 25, 25)), 3: prism((90, 70, 30, 20))})
+    return PlanarPhysics({1: prism((60, 60, 25, 25)), 2: prism((60, 90, 25, 25)), 3: prism((90, 70, 30, 20))})
 
 
 def pushed(by, start, theta, length_m=LENGTH_M):
@@ -72,14 +72,14 @@ def test_the_way_to_the_first_object_changes_nothing():
 
 
 def test_what_is_lower_than_the_tips_stays():
-    low = SlidingTable({1: prism((60, 60, 25, 25), height_m=0.015)})
+    low = PlanarPhysics({1: prism((60, 60, 25, 25), height_m=0.015)})
     assert pushed(low, (0.08, 0.145), 0.0) == {}
-    assert pushed(SlidingTable({1: prism((60, 60, 25, 25))}), (0.08, 0.145), 0.0).keys() == {1}
+    assert pushed(PlanarPhysics({1: prism((60, 60, 25, 25))}), (0.08, 0.145), 0.0).keys() == {1}
 
 
 def test_what_is_high_is_met_by_the_cranks_above_the_fingers():
     low, high = (
-        pushed(SlidingTable({1: prism((60, 60, 25, 25), height_m=height_m)}), (0.08, 0.145), 0.0)[1][0, 2]
+        pushed(PlanarPhysics({1: prism((60, 60, 25, 25), height_m=height_m)}), (0.08, 0.145), 0.0)[1][0, 2]
         for height_m in (0.04, 0.10)
     )
     # They stand out 10 mm farther.
@@ -87,7 +87,7 @@ def test_what_is_high_is_met_by_the_cranks_above_the_fingers():
 
 
 def test_an_empty_table_can_be_pushed_over():
-    assert pushed(SlidingTable({}), (0.1, 0.1), 1.0) == {}
+    assert pushed(PlanarPhysics({}), (0.1, 0.1), 1.0) == {}
 
 
 def test_a_speck_is_no_object():

@@ -1,98 +1,93 @@
-"""What a push promises."""
-
-from dataclasses import replace
+"""What pushes are good for."""
 
 import numpy as np
 import pytest
 
-from policy.grasp_room import Jaw
-from policy.network.q_network import GRASP
-from policy.push.outcome import Foresight, Played
-from policy.push.value import Prospects
+from policy.push.border import USEFUL_GAIN
+from policy.push.outcome import PushForwardModel
+from policy.push.value import evaluate_pushes
 from robotcell.config import CellConfig
-from robotcell.errors import ConfigError
+from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
+from robotcell.motion.push import push_in_workspace
 from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
-RESOLUTION_M = CONFIG.workspace.resolution_m
-JAW = Jaw(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
-STAYS = Played({}, frozenset())
+PUSH_M = CONFIG.motion.push_m
 
 
-class Network:
-    """Grasps anything anywhere, best along +x, and keeps what it was shown."""
+def look(*corners, task=None, barred=()):
+    """Cubes of 50 mm by their first row and column; `task` is made of the cells of the first."""
+    heights, labels = np.zeros((224, 224), np.float32), np.zeros((224, 224), np.int32)
+    for label, (row, col) in enumerate(corners, start=1):
+        place = slice(row, row + 25), slice(col, col + 25)
+        heights[place], labels[place] = 0.05, label
+    return Observation(heightmap(heights), labels, PickAny() if task is None else task(labels == 1), barred)
 
-    def __init__(self, value=0.9):
-        self.value = value
-        self.seen = []
 
-    def maps(self, planes, cells, primitive):
-        assert primitive == GRASP
-        self.seen.append((planes, cells))
-        q = np.full((8, *cells.shape), np.float32(np.nan))
-        q[:, cells] = 0.1
-        q[0, cells] = self.value
+def evaluate(observation, value=lambda cells: np.zeros(cells.shape, np.float32)):
+    model = PushForwardModel(observation.labels, observation.heightmap)
+    return evaluate_pushes(observation, model, PUSH_M, value)
+
+
+def test_every_direction_has_its_push_of_a_lone_goal():
+    found = evaluate(look((100, 100), task=PickGoal))
+    assert [push.candidate.rotation for push in found] == list(range(16))
+    for push in found:
+        assert push.moves
+        assert (push.wanted, push.gain, push.uncovered, push.loss) == (1, 0.0, 0.0, 0.0)
+
+
+def test_a_push_out_of_a_row_frees_the_goal_and_one_along_it_does_not():
+    gains = {
+        push.candidate.rotation: push.gain
+        for push in evaluate(look((100, 100), (100, 126), task=PickGoal))
+        if push.candidate.cell[1] < 125
+    }
+    assert gains[4] > USEFUL_GAIN
+    assert gains.get(0, 0.0) < USEFUL_GAIN
+
+
+def test_without_a_goal_a_push_is_for_the_object_that_it_passes_through():
+    observation = look((60, 60), (140, 140))
+    found = evaluate(observation)
+    assert {push.wanted for push in found} <= {1, 2}
+    assert all(push.wanted == observation.labels[push.candidate.cell] for push in found)
+
+
+def test_what_hides_a_goal_is_to_be_uncovered():
+    found = evaluate(look((100, 100), task=Uncover))
+    assert len(found) > 16  # side by side: the goal need not lie in the middle
+    assert max(push.uncovered for push in found) > 0.9
+    assert {(push.wanted, push.gain) for push in found} == {(None, 0.0)}
+
+
+def test_to_lose_what_is_wanted_costs_more_than_to_lose_another():
+    (wanted,) = (p for p in evaluate(look((100, 190), task=PickGoal)) if p.candidate.rotation == 0)
+    (other,) = (p for p in evaluate(look((100, 120), (100, 165), task=PickGoal)) if p.candidate.rotation == 0)
+    (safe,) = (p for p in evaluate(look((100, 100), task=PickGoal)) if p.candidate.rotation == 0)
+    assert wanted.loss > other.loss > safe.loss == 0.0
+
+
+def test_a_push_that_failed_is_not_proposed_again():
+    observation = look((100, 100), task=PickGoal)
+    line = evaluate(observation)[3].candidate.line
+    start = CONFIG.workspace.position(line.row, line.col)
+    failed = push_in_workspace(start, 3, PUSH_M, line.top_m, 0.0, CONFIG.workspace)
+    again = evaluate(look((100, 100), task=PickGoal, barred=(failed,)))
+    assert 3 not in {push.candidate.rotation for push in again}
+
+
+def test_q_chooses_among_pushes_in_the_same_direction():
+    def better_rows(cells):
+        q = np.zeros(cells.shape, np.float32)
+        q[:, 106:109] = 0.9
         return q
 
-
-class View:
-    """Boxes of 50 x 50 x 50 mm on a bare table, by their first row and column."""
-
-    def __init__(self, *corners, network=None):
-        self.network = network or Network()
-        height_m = np.zeros(CONFIG.workspace.shape, np.float32)
-        labels = np.zeros(CONFIG.workspace.shape, np.int32)
-        for label, (row, col) in enumerate(corners, start=1):
-            place = slice(row, row + 25), slice(col, col + 25)
-            height_m[place], labels[place] = 0.05, label
-        color = np.full((*labels.shape, 3), 90, np.uint8)
-        color[labels > 0] = 200, 40, 40
-        view = replace(heightmap(height_m), color=color)
-        self.foresight = Foresight(labels, view)
-        self.prospects = Prospects(self.network, self.foresight, labels, view, JAW)
-
-    def promise(self, label=1, played=STAYS):
-        return self.prospects.after(label, self.foresight.around(label, played))
+    (push,) = (p for p in evaluate(look((100, 100), task=PickGoal), better_rows) if p.candidate.rotation == 0)
+    assert 106 <= push.candidate.cell[0] < 109
+    assert push.candidate.q == pytest.approx(0.9)
 
 
-def moved(label, x_m, y_m=0.0, turn=0.0):
-    cos, sin = np.cos(turn), np.sin(turn)
-    return Played({label: np.array([[cos, -sin, x_m], [sin, cos, y_m], [0, 0, 1]])}, frozenset())
-
-
-def test_an_object_that_stands_alone_promises_the_q_of_its_grasps():
-    assert View((100, 100)).promise() == pytest.approx(0.9, abs=0.15)
-
-
-def test_neighbours_on_both_sides_of_the_jaw_leave_little():
-    assert View((100, 100), (100, 73), (100, 127)).promise() < 0.1
-
-
-def test_a_push_that_takes_a_neighbour_away_promises_more():
-    view = View((100, 100), (100, 73), (100, 127))
-    before = view.promise()
-    one = view.promise(played=moved(2, -0.05))
-    both = view.promise(played=Played({**moved(2, -0.05).moves, **moved(3, 0.05).moves}, frozenset()))
-    assert before == one  # the other finger still finds no room
-    assert both > before + 0.5
-
-
-def test_the_object_that_moves_away_promises_as_much():
-    view = View((100, 100), (100, 73), (100, 127))
-    # Out of the row, and turned: the grasps go with it.
-    assert view.promise(played=moved(1, 0.05, 0.25, 0.3)) == pytest.approx(View((100, 100)).promise(), abs=0.1)
-
-
-def test_the_network_is_asked_once_for_an_object_and_sees_no_other():
-    view = View((100, 100), (100, 127))
-    view.promise()
-    view.promise(played=moved(2, 0.05))
-    ((planes, cells),) = view.network.seen
-    assert np.count_nonzero(cells) == 25 * 25
-    assert not planes[0][~cells].any()
-    assert len(np.unique(planes[2:, ~cells], axis=1).T) == 1
-
-
-def test_broken_maps_are_an_error():
-    with pytest.raises(ConfigError, match="grasp maps hold"):
-        View((100, 100), network=Network(np.nan)).promise()
+def test_an_object_without_a_place_to_start_has_no_push():
+    heights, labels = np.full((224, 224), 0.05, np.float32), np.ones((224, 224), np.int32)
+    assert evaluate(Observation(heightmap(heights), labels, PickAny())) == []

@@ -12,7 +12,6 @@ from policy.training.environment import (
     PUSH_REWARD,
     Outcome,
     PushGraspEnv,
-    border_occupancy,
 )
 from robotcell.config import load_config
 
@@ -90,19 +89,16 @@ def test_a_goal_that_is_grasped_is_rewarded_and_leaves_the_table(env):
 
 
 def test_a_step_in_stage_2_ends_with_the_goal(env):
-    goal, cell = env.goal, middle(env, env.goal)
-    ended = []
-    for k in range(8):
-        _, reward, over, truncated, info = env.step(np.array([GRASP, k, *cell]))
-        assert reward in {0.0, 1.0}
-        assert over == (reward == 1.0)
-        assert not truncated
-        ended.append(over)
-        if over:
-            assert info["goal"] != goal
-            break
-        cell = middle(env, goal)
-    assert any(ended) or env.goal == goal
+    env.reset(seed=SEED, options={"kind": "drop", "count": 2})
+    goal = env.goal
+    (other,) = set(env.state.occupied) - {goal}
+    _, reward, over, truncated, info = env.step(np.array([GRASP, 0, *middle(env, other)]))
+    assert (reward, over, truncated, info["outcome"]) == (0.0, False, False, Outcome.PICKED)
+    assert info["goal"] == goal
+    _, reward, over, truncated, info = env.step(np.array([GRASP, 0, *middle(env, goal)]))
+    assert (reward, over, truncated, info["outcome"]) == (1.0, True, False, Outcome.PICKED)
+    assert info["goal"] == 0
+    assert not info["labels"].any()
 
 
 def test_a_push_tells_of_every_object_on_its_way(env):
@@ -118,20 +114,6 @@ def test_a_push_tells_of_every_object_on_its_way(env):
                 assert set(rewards) <= {0.0, PUSH_REWARD}
                 assert not goes_on or trial.after is not None
     assert Outcome.PUSHED in seen
-
-
-def test_the_border_of_an_object_is_occupied_by_what_stands_beside_it():
-    heights = np.zeros((100, 100), np.float32)
-    mask = np.zeros((100, 100), np.bool_)
-    mask[40:60, 40:60] = True
-    heights[mask] = 0.05
-    assert border_occupancy(mask, heights) == 0.0
-    heights[30:70, 60:70] = 0.05
-    # The border is 40 x 40 cells less 20 x 20, the neighbour takes 10 x 40 of it.
-    assert border_occupancy(mask, heights) == pytest.approx(400 / 1200)
-    heights[30:70, 60:70] = 0.015
-    assert border_occupancy(mask, heights) == 0.0
-    assert border_occupancy(np.zeros_like(mask), heights) == 0.0
 
 
 def test_what_is_done_aside_is_undone(env):

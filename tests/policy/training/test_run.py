@@ -17,7 +17,7 @@ from policy.training.checkpoint import load_checkpoint, save_checkpoint
 from policy.training.config import LearningSettings, StageSettings, TrainConfig
 from policy.training.run import prepare, read_metrics, train
 from policy.training.shard import Shard
-from robotcell.errors import ConfigError
+from robotcell.errors import ConfigError, StorageError
 from tests.policy.training import toy
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ def test_what_cannot_start_says_why(another: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="2 of 3 rounds"):
         prepare(2, another)
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="cannot be made"):
+    with pytest.raises(StorageError, match="cannot be made"):
         prepare(1, tmp_path / "file")
 
 
