@@ -28,7 +28,7 @@ bench: setup
 
 # The site, in site/. Broken links and every other warning are errors. Needs the network only to install, once.
 docs: $(VENV)/.docs-installed
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "site/index.html"
 
 $(VENV)/.docs-installed: $(VENV)/.installed
