@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig, Workspace
     from robotcell.jobs.policy_api import Action, Observation
 
-# Half the step at which the profile between the fingers is sampled would be finer than a camera at 1 m tells.
+# Its margins were set on cells of that size, which are about what a pixel of the camera covers at 1 m.
 RESOLUTION_M = 0.002
 # A grasp that scores less is worth a push first, where one is allowed.
 CLEAR_GRASP = 0.30

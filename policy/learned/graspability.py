@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from policy.finger_clearance import OpenGripper, PaddedMaps, finger_clearance, smoothed_tops
 from policy.learned.selection import QCells, best_cells, check_maps, smoothed
-from policy.network.encoding import encode
-from policy.network.q_network import GRASP
+from policy.network.encoding import GRASP, encode
 from policy.push.candidates import thinned
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from policy.finger_clearance import OpenGripper, finger_clearance, finger_reach_
 from policy.learned.graspability import Graspability
 from policy.learned.selection import best_cells, check_maps, smoothed, surface_at
 from policy.map_grid import cell_centers, check_resolution, workspace_at
-from policy.network.encoding import RESOLUTION_M, encode
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import GRASP, PUSH, RESOLUTION_M, encode
 from policy.push.border import USEFUL_GAIN
 from policy.push.outcome import PushForwardModel
 from policy.push.value import PushValue, evaluate_pushes

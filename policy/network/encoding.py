@@ -6,6 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 CHANNELS = 5
+# Channels of the Q maps that it answers with; here, so that who only plays scenes need not import torch.
+GRASP, PUSH = 0, 1
 # Cells of the maps that the networks are trained on and work at (paper: 2 mm).
 RESOLUTION_M = 0.002
 

@@ -12,9 +12,8 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from policy.network.encoding import RESOLUTION_M
+from policy.network.encoding import GRASP, PUSH, RESOLUTION_M
 from policy.network.precision import autocast
-from policy.network.q_network import GRASP, PUSH
 from policy.network.rotation import Copies
 from policy.network.weights import load_weights
 from robotcell.motion.rotations import GRASP_ROTATIONS, ROTATIONS
@@ -28,7 +27,7 @@ MARGIN_M = 0.064
 _PLANES = {GRASP: GRASP_ROTATIONS, PUSH: ROTATIONS}
 # Cells of copies that pass the network at once: what the paper's network keeps of them takes 1 GB. Neither network is
 # faster on more.
-_CELLS_AT_ONCE = 2**19
+CELLS_AT_ONCE = 2**19
 
 
 class Inference:
@@ -37,9 +36,11 @@ class Inference:
     Args:
         network: Q maps of grasps and pushes along +x, see `policy.network.q_network.QNetwork`.
         margin_m: how far around the cells in question the network is shown the map.
+        cells_at_once: cells of copies that pass the network together, or one copy if it is larger.
     """
 
-    def __init__(self, network: nn.Module, margin_m: float = MARGIN_M) -> None:
+    def __init__(self, network: nn.Module, margin_m: float = MARGIN_M, cells_at_once: int = CELLS_AT_ONCE) -> None:
+        self._cells_at_once = cells_at_once
         self._margin = round(margin_m / RESOLUTION_M)
         self._network = copy.deepcopy(network).eval()
         fuse_norms(self._network)
@@ -68,7 +69,7 @@ class Inference:
         rotations = np.flatnonzero(each.any(axis=(1, 2)))
         copies = Copies.around(each[rotations], rotations.tolist(), self._margin)
         x = torch.from_numpy(copies.turn(planes))
-        at_once = max(1, _CELLS_AT_ONCE // math.prod(copies.shape))
+        at_once = max(1, self._cells_at_once // math.prod(copies.shape))
         with torch.inference_mode(), autocast(x.device):
             q = torch.cat([self._network(x[i : i + at_once])[:, primitive] for i in range(0, len(x), at_once)])
         maps = np.full(each.shape, np.nan, np.float32)

@@ -17,8 +17,6 @@ from policy.network.encoding import CHANNELS
 if TYPE_CHECKING:
     from torch import Tensor
 
-# Channels of the Q maps.
-GRASP, PUSH = 0, 1
 
 # The network works on blocks of 4 x 4 cells (8 mm), with all that is in them as channels.
 _FOLD = 4

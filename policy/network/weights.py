@@ -24,6 +24,7 @@ from robotcell.io.atomic_file import replaced
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from importlib.abc import Traversable
     from pathlib import Path
 
     from torch import Tensor, nn
@@ -96,15 +97,19 @@ def load_weights(path: Path) -> tuple[nn.Module, dict[str, str]]:
     return network.eval(), metadata
 
 
-def load_named(name: str) -> tuple[nn.Module, dict[str, str]]:
+def load_named(name: str, folder: Traversable | None = None) -> tuple[nn.Module, dict[str, str]]:
     """What `load_weights` gives, of the weights of that name that come with the package.
+
+    Args:
+        name: one of `NAMED`.
+        folder: of the weights files; None for that of the package.
 
     Raises:
         ConfigError: there are none, or the file is not as it should be.
     """
     if name not in NAMED:
         raise ConfigError(f"no weights are called {name!r}; there is: {', '.join(NAMED)}")
-    source = resources.files("policy") / "data" / f"{name}.safetensors"
+    source = (folder or resources.files("policy") / "data") / f"{name}.safetensors"
     if not source.is_file():
         raise ConfigError(
             f"the weights {name!r} are not part of this installation (policy/data/{name}.safetensors is missing); "

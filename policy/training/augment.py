@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from policy.network.encoding import RESOLUTION_M, encode
-from policy.network.q_network import GRASP
+from policy.network.encoding import GRASP, RESOLUTION_M, encode
 from policy.network.rotation import turn_matrix
 from policy.training.shard import unpack_height
 from robotcell.motion.rotations import ROTATIONS
@@ -34,9 +33,14 @@ _OFFSET_M = 0.0007
 
 
 def crop(
-    view: View, primitive: int, cell: tuple[int, int], rotation: int, rng: np.random.Generator | None
+    view: View,
+    primitive: int,
+    cell: tuple[int, int],
+    rotation: int,
+    rng: np.random.Generator | None,
+    side: int = CROP_CELLS,
 ) -> npt.NDArray[np.float32]:
-    """(5, CROP_CELLS, CROP_CELLS) encoded surroundings of a cell, which lies in the middle.
+    """(5, side, side) encoded surroundings of a cell, which lies in the middle.
 
     Args:
         view: (H, W) of the state.
@@ -44,10 +48,11 @@ def crop(
         cell: (row, column).
         rotation: of the attempt.
         rng: of the variations: a little turn and shift, mirror image, colours, table height. None for none.
+        side: rows and columns of the crop.
     """
     if rng is not None and primitive == GRASP and rng.random() < 0.5:
         rotation += ROTATIONS // 2
-    middle = (CROP_CELLS / 2, CROP_CELLS / 2)
+    middle = (side / 2, side / 2)
     M = turn_matrix(rotation, cell, (0.0, 0.0))
     if rng is not None:
         cos, sin = math.cos(angle := rng.normal(0, _TURN_RAD)), math.sin(angle)
@@ -57,9 +62,7 @@ def crop(
             M[1] *= -1
     M[:, 2] += middle
     height, color = (
-        cv2.warpAffine(
-            image, M, (CROP_CELLS, CROP_CELLS), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
-        )
+        cv2.warpAffine(image, M, (side, side), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         for image in (view.height, view.color)
     )
     heights = unpack_height(np.asarray(height, np.uint16))

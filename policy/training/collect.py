@@ -8,7 +8,7 @@ push the network's grasp of what was pushed is tried as well: whether that came 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -43,11 +43,22 @@ _FOLLOWED = 6
 _GEOMETRIC_SHARE = 0.5
 # A state whose best grasp succeeds is left by it, or by a push with this probability (stage I, stage II).
 _LEAVE_BY_PUSH = (0.15, 0.35)
+
+
+class SceneKind(NamedTuple):
+    """A kind of scene (`policy.training.scenes`), how many objects it has, and its share of the scenes."""
+
+    kind: str
+    least: int
+    most: int
+    share: float
+
+
 # Stage I: about ten objects, dropped, as the paper has it; stage II: up to thirty. Or a group, or an object that others
 # stand around.
 _KINDS = {
-    1: (("drop", 6, 14, 0.6), ("packed", 4, 10, 0.2), ("enclosed", 3, 8, 0.2)),
-    2: (("drop", 14, 30, 0.35), ("packed", 4, 12, 0.25), ("enclosed", 3, 8, 0.4)),
+    1: (SceneKind("drop", 6, 14, 0.6), SceneKind("packed", 4, 10, 0.2), SceneKind("enclosed", 3, 8, 0.2)),
+    2: (SceneKind("drop", 14, 30, 0.35), SceneKind("packed", 4, 12, 0.25), SceneKind("enclosed", 3, 8, 0.4)),
 }
 
 
@@ -61,6 +72,7 @@ class Collection:
         weights: of the network; None explores without one.
         exploration: share of the attempts that explore.
         settings: how many attempts in a state, and how many states of a scene.
+        kinds: of the scenes; those of the stage where none is given.
     """
 
     stage: int
@@ -68,6 +80,7 @@ class Collection:
     weights: Path | None
     exploration: float
     settings: CollectSettings
+    kinds: tuple[SceneKind, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -150,8 +163,8 @@ def collect(collection: Collection) -> Shard:
     try:
         for seed in collection.seeds:
             rng = np.random.default_rng([seed, 1])
-            kinds = _KINDS[collection.stage]
-            kind, low, high, _ = kinds[int(rng.choice(len(kinds), p=[share for *_, share in kinds]))]
+            kinds = collection.kinds or _KINDS[collection.stage]
+            kind, low, high, _ = kinds[int(rng.choice(len(kinds), p=[kind.share for kind in kinds]))]
             env.reset(seed=seed, options={"kind": kind, "count": int(rng.integers(low, high + 1))})
             _play(env, seed, collection, network, config, rng, book)
     finally:

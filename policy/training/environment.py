@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from policy.learned.selection import surface_at
 from policy.map_grid import workspace_at
-from policy.network.encoding import CHANNELS, RESOLUTION_M, encode
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import CHANNELS, GRASP, PUSH, RESOLUTION_M, encode
 from policy.push.border import USEFUL_GAIN, border_occupancy
 from policy.push.line import PushLine, free_to_descend, push_line
 from policy.training.scenes import training_scene

@@ -14,12 +14,11 @@ from scipy.stats import rankdata
 from torch.nn import functional
 
 from policy.learned.selection import best_cells, smoothed
-from policy.network.encoding import RESOLUTION_M, encode
+from policy.network.encoding import GRASP, PUSH, RESOLUTION_M, encode
 from policy.network.inference import MARGIN_M
 from policy.network.precision import autocast
-from policy.network.q_network import GRASP, PUSH
 from policy.network.rotation import Copies
-from policy.training.augment import crop
+from policy.training.augment import CROP_CELLS, crop
 from policy.training.shard import unpack_height
 from robotcell.motion.rotations import GRASP_ROTATIONS
 
@@ -55,11 +54,19 @@ class Learner:
         stage: 1 or 2, which seeds the draws.
         planned_updates: of the stage; learning rate and beta follow them.
         seed: makes what is drawn and how it is varied a function of the number of the update.
+        crop_cells: rows and columns of the surroundings that the network learns from.
     """
 
     def __init__(
-        self, network: nn.Module, settings: LearningSettings, stage: int, planned_updates: int, seed: int
+        self,
+        network: nn.Module,
+        settings: LearningSettings,
+        stage: int,
+        planned_updates: int,
+        seed: int,
+        crop_cells: int = CROP_CELLS,
     ) -> None:
+        self._crop_cells = crop_cells
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.online = network.to(device=self.device)
         self.online.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # missing in torch's stubs
@@ -93,7 +100,7 @@ class Learner:
         importance = np.concatenate([weights for _, weights in drawn])
         attempts = replay.attempts.take(numbers)
         wanted = attempts.reward + np.float32(settings.gamma) * replay.value[numbers]
-        losses, errors = self.learn(_crops(replay, numbers, rng), attempts.primitive, wanted, importance)
+        losses, errors = self.learn(self._crops(replay, numbers, rng), attempts.primitive, wanted, importance)
         replay.update(numbers, errors)
         return losses
 
@@ -178,7 +185,7 @@ class Learner:
         maps[:, copies.rows, copies.cols] = copies.values(q)
         best = best_cells(smoothed(maps, cells, RESOLUTION_M), cells, 1)
         rotation, row, col = int(best.rotation[0]), int(best.row[0]), int(best.col[0])
-        chosen = crop(view, GRASP, (row, col), rotation, None)[None]
+        chosen = crop(view, GRASP, (row, col), rotation, None, self._crop_cells)[None]
         return float(self._at_middle(self.target, chosen, np.array([GRASP]))[0])
 
     @torch.no_grad()
@@ -189,7 +196,7 @@ class Learner:
         attempts = replay.attempts.take(numbers)
         parts = [numbers[i : i + _VALIDATION_BATCH] for i in range(0, len(numbers), _VALIDATION_BATCH)]
         values = [
-            self._at_middle(self.online, _crops(replay, part, None), replay.attempts.primitive[part]).cpu().numpy()
+            self._at_middle(self.online, self._crops(replay, part, None), replay.attempts.primitive[part]).cpu().numpy()
             for part in parts
         ]
         value = np.concatenate([np.empty(0, np.float32), *values])
@@ -214,6 +221,18 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         self.updates = state["updates"]
 
+    def _crops(
+        self, replay: Replay, numbers: npt.NDArray[np.int64], rng: np.random.Generator | None
+    ) -> npt.NDArray[np.float32]:
+        """(N, 5, S, S) the surroundings of attempts, varied where there is an `rng`."""
+        each = zip(*replay.attempts.take(numbers)[:7], strict=True)
+        return np.stack(
+            [
+                crop(replay.view(shard, state), kind, (row, col), rotation, rng, self._crop_cells)
+                for shard, state, _, kind, row, col, rotation in (map(int, attempt) for attempt in each)
+            ]
+        )
+
     def _at_middle(
         self, network: nn.Module, crops: npt.NDArray[np.float32], primitive: npt.NDArray[np.int64]
     ) -> Tensor:
@@ -234,17 +253,6 @@ def auc(values: npt.NDArray[np.float32], positive: npt.NDArray[np.bool_]) -> flo
         return math.nan
     ranks = rankdata(values)
     return float((ranks[positive].sum() - positives * (positives + 1) / 2) / (positives * negatives))
-
-
-def _crops(replay: Replay, numbers: npt.NDArray[np.int64], rng: np.random.Generator | None) -> npt.NDArray[np.float32]:
-    """(N, 5, S, S) the surroundings of attempts, varied where there is an `rng`."""
-    each = zip(*replay.attempts.take(numbers)[:7], strict=True)
-    return np.stack(
-        [
-            crop(replay.view(int(shard), int(state)), int(kind), (int(row), int(col)), int(rotation), rng)
-            for shard, state, _, kind, row, col, rotation in each
-        ]
-    )
 
 
 def _mean(values: npt.NDArray[np.float32]) -> float:

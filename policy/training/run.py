@@ -1,20 +1,15 @@
 """A training run: rounds of playing scenes, learning from all that was played, and a checkpoint.
 
-Everything lies in the folder of the run, and everything random is a function of the configuration and of the number
-of the round or update. So a run that was killed goes on where it was, and any number of workers plays the same.
-
-    metrics.jsonl, curves.png, weights.safetensors      of the newest round
-    stage1/, stage2/    train.toml, checkpoint.pt, weights.safetensors, shards/r0003-t002.npz (round, task)
+Everything lies in the folder of the run (`policy.training.run_folder`), and everything random is a function of the
+configuration and of the number of the round or update. So a run that was killed goes on where it was, and any number
+of workers plays the same.
 """
 
 from __future__ import annotations
 
 import fcntl
-import json
 import math
-import shutil
 import time
-import zipfile
 from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
@@ -22,9 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import GRASP, PUSH
 from policy.network.registry import make_network
-from policy.network.weights import save_weights
 from policy.rollouts import run_tasks
 from policy.training import collect as playing
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
@@ -32,17 +26,27 @@ from policy.training.config import load_train_config, save_train_config, single_
 from policy.training.curves import draw_curves
 from policy.training.learner import Learner
 from policy.training.replay import Replay
-from policy.training.shard import Shard
+from policy.training.run_folder import (
+    finished_stage1,
+    load_shard,
+    newest_shards,
+    read_metrics,
+    round_of,
+    shard_paths,
+    write_metrics,
+    write_weights,
+)
 from robotcell.errors import ConfigError
-from robotcell.io.atomic_file import make_folder, replaced, write_whole
+from robotcell.io.atomic_file import make_folder, replaced
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from policy.training.config import TrainConfig
+    from policy.training.run_folder import Metrics
+    from policy.training.shard import Shard
 
-    Metrics = dict[str, float]
     # (what is being done, how much of it is done, of how much)
     Progress = Callable[[str, int, int], None]
 
@@ -135,25 +139,11 @@ def prepare(
     if stage == 1 and config.single_stage:
         raise ConfigError("there is no stage 1 in a single-stage training; use --stage 2")
     if stage == 2 and not config.single_stage:
-        _check_stage1(run)
+        finished_stage1(run)
     make_folder(folder / "shards")
     with replaced(written) as part:
         save_train_config(config, part)
     return config
-
-
-def read_metrics(run: Path) -> list[Metrics]:
-    """The metrics of all rounds so far; a line that was cut off by a kill is left out."""
-    path = run / "metrics.jsonl"
-    if not path.exists():
-        return []
-    lines = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            lines.append({key: math.nan if value is None else value for key, value in json.loads(line).items()})
-        except ValueError:
-            continue
-    return lines
 
 
 def _train(
@@ -170,7 +160,7 @@ def _train(
     plan = config.stage(stage)
     torch.manual_seed(config.seed)
     learner = Learner(make_network(config.architecture), config.learning, stage, plan.updates, config.seed)
-    earlier = [] if stage == 1 or config.single_stage else _finished_stage1(run, learner)
+    earlier = [] if stage == 1 or config.single_stage else _start_from_stage1(run, learner)
     first = 0
     checkpoint = None
     if (folder / "checkpoint.pt").exists():
@@ -178,17 +168,17 @@ def _train(
         learner.load_state(checkpoint)
         first = checkpoint["rounds"]
     history = [line for line in read_metrics(run) if (line["stage"], line["round"]) < (stage, first)]
-    _write_metrics(run, history)
+    write_metrics(run, history)
     replay = Replay(stage, config.learning.capacity_states, config.learning.priority_alpha)
-    played = [path for path in _shard_paths(folder) if _round_of(path) < first]
-    replay.extend(_newest([*earlier, *played], config.learning.capacity_states))
+    played = [path for path in shard_paths(folder) if round_of(path) < first]
+    replay.extend(newest_shards([*earlier, *played], config.learning.capacity_states))
     if checkpoint is None and earlier:
         _take_over_values(replay, load_checkpoint(run / "stage1" / "checkpoint.pt"))
     elif checkpoint is not None and len(checkpoint["priorities"]) == len(replay):
         # Somebody may have deleted a shard; then all attempts are as new.
         replay.priorities = checkpoint["priorities"].numpy()
         replay.value, replay.valued = checkpoint["value"].numpy(), checkpoint["valued"].numpy()
-    _write_weights(run, folder, config, stage, learner, history)
+    write_weights(run, folder, config, stage, learner, history)
     for round_ in range(first, plan.rounds):
         start = time.perf_counter()
         shards, collected = _collect(config, stage, round_, folder, collect, workers, ray_address, on_progress)
@@ -211,7 +201,7 @@ def _train(
         }
         history.append(metrics)
         # The metrics first: a round without a checkpoint is done again, and its line is written anew.
-        _write_metrics(run, history)
+        write_metrics(run, history)
         state = {"rounds": round_ + 1, "stage": stage, "config": config.model_dump_json()}
         state |= {
             "priorities": torch.from_numpy(replay.priorities),
@@ -219,7 +209,7 @@ def _train(
             "valued": torch.from_numpy(replay.valued),
         }
         save_checkpoint(folder / "checkpoint.pt", {**learner.state(), **state})
-        _write_weights(run, folder, config, stage, learner, history)
+        write_weights(run, folder, config, stage, learner, history)
         draw_curves(history, run / "curves.png")
         on_round(metrics)
 
@@ -263,7 +253,7 @@ def _collect(
                 attempts += len(shard.state)
                 on_progress("collect", done, len(paths))
     seconds = time.perf_counter() - start
-    shards = [_load(path) for path in paths]
+    shards = [load_shard(path) for path in paths]
     return shards, {
         "scenes": len(seeds),
         "states": sum(len(shard.scene) for shard in shards),
@@ -317,12 +307,12 @@ def _learn(learner: Learner, replay: Replay, round_: int, until: int, on_progres
     }
 
 
-def _finished_stage1(run: Path, learner: Learner) -> list[Path]:
+def _start_from_stage1(run: Path, learner: Learner) -> list[Path]:
     """Start from the network of stage 1; its shards."""
-    state = _check_stage1(run)
+    state = finished_stage1(run)
     learner.online.load_state_dict(state["online"])
     learner.target.load_state_dict(state["online"])
-    return _shard_paths(run / "stage1")
+    return shard_paths(run / "stage1")
 
 
 def _take_over_values(replay: Replay, stage1: dict[str, torch.Tensor]) -> None:
@@ -330,78 +320,3 @@ def _take_over_values(replay: Replay, stage1: dict[str, torch.Tensor]) -> None:
     if len(stage1["value"]) == len(replay):
         replay.value = stage1["value"].numpy()
         replay.valued = np.minimum(stage1["valued"].numpy(), 0)
-
-
-def _check_stage1(run: Path) -> dict[str, dict[str, torch.Tensor]]:
-    folder = run / "stage1"
-    path = folder / "checkpoint.pt"
-    if not path.exists():
-        raise ConfigError(
-            f"{folder}: stage 2 goes on from stage 1, and no round of it is finished; run --stage 1 first, or "
-            "--from-scratch to do without"
-        )
-    state = load_checkpoint(path)
-    planned = load_train_config(folder / "train.toml").stage1.rounds
-    if state["rounds"] < planned:
-        raise ConfigError(
-            f"{folder}: stage 1 has finished {state['rounds']} of {planned} rounds; run --stage 1 --resume first"
-        )
-    return state
-
-
-def _shard_paths(folder: Path) -> list[Path]:
-    """In the order in which they were asked for."""
-    return sorted((folder / "shards").glob("r*-t*.npz"))
-
-
-def _round_of(path: Path) -> int:
-    return int(path.name[1:5])
-
-
-def _newest(paths: list[Path], capacity_states: int) -> list[Shard]:
-    """The newest shards that the replay has room for, oldest first: what fell out of it need not be read."""
-    shards: list[Shard] = []
-    states = 0
-    for path in reversed(paths):
-        shard = _load(path)
-        states += len(shard.scene)
-        if shards and states > capacity_states:
-            break
-        shards.append(shard)
-    return shards[::-1]
-
-
-def _load(path: Path) -> Shard:
-    try:
-        return Shard.load(path)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise ConfigError(
-            f"{path}: not a whole shard ({error}); delete it and go on with --resume, which plays its scenes again "
-            "if the round needs them"
-        ) from error
-
-
-def _write_weights(
-    run: Path, folder: Path, config: TrainConfig, stage: int, learner: Learner, history: list[Metrics]
-) -> None:
-    """The online network: for the next round's workers, and as the newest of the run."""
-    card = {
-        "stage": str(stage),
-        "updates": str(learner.updates),
-        "training": config.model_dump_json(),
-        "last_round": _json(history[-1]) if history else "{}",
-    }
-    weights = folder / "weights.safetensors"
-    save_weights(weights, learner.online, config.architecture, card)
-    with replaced(run / weights.name) as part:
-        shutil.copyfile(weights, part)
-
-
-def _write_metrics(run: Path, history: list[Metrics]) -> None:
-    write_whole(run / "metrics.jsonl", "".join(_json(line) + "\n" for line in history))
-
-
-def _json(metrics: Metrics) -> str:
-    """One line; what is not a number is null."""
-    known = {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in metrics.items()}
-    return json.dumps(known)

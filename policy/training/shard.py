@@ -29,7 +29,7 @@ class Shard:
             same number in all states of its scene.
         scene: (S,) int32 seed of the scene that the state belongs to.
         state: (N,) int32 state in which the attempt was made.
-        primitive: (N,) int8, `policy.network.q_network.GRASP` or `PUSH`.
+        primitive: (N,) int8, `policy.network.encoding.GRASP` or `PUSH`.
         row, col: (N,) int16 cell of the Q map.
         rotation: (N,) int8 plane of the Q map, 0..7 for a grasp and 0..15 for a push.
         target: (N,) int16 object that the cell belongs to; the rewards of stage II are those of this object as goal.

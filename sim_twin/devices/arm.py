@@ -30,7 +30,7 @@ PROTECTIVE_FORCE_N = 150.0
 # A joint this far from where it should be could not follow: its motor is at its limit. Assumed.
 TRACKING_ERROR_RAD = 0.05
 # Half more than at the fastest joint speed: a target that leaps further within a period is no path. The real controller
-# stops with C204, "path sanity check failed" (Universal Robots, error codes); its threshold is not public. Assumed.
+# stops with "path sanity check failed"; its threshold is not public. Assumed.
 MAX_TARGET_SPEED_RAD_S = 1.5 * ur5e.MAX_JOINT_SPEED
 # A motion that starts pressed against something may press this much more. Assumed.
 LEAVING_FORCE_N = 30.0

@@ -10,8 +10,7 @@ import time
 import numpy as np
 
 from policy.rollouts import run_tasks
-from policy.training import collect as collecting
-from policy.training.collect import Collection, collect
+from policy.training.collect import Collection, SceneKind, collect
 from policy.training.config import CollectSettings
 from policy.training.environment import Outcome
 from policy.training.shard import Shard
@@ -23,8 +22,7 @@ SETTINGS = CollectSettings(grasps=12, pushes=4)
 
 def ten_objects(seed: int) -> Shard:
     """One scene of ten dropped objects."""
-    collecting._KINDS = {1: (("drop", 10, 10, 1.0),)}
-    return collect(Collection(1, (seed,), None, 1.0, SETTINGS))
+    return collect(Collection(1, (seed,), None, 1.0, SETTINGS, (SceneKind("drop", 10, 10, 1.0),)))
 
 
 def attempts(shard: Shard) -> int:

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from rich.progress import track
 
-from policy.network.encoding import encode
+from policy.network.encoding import GRASP, PUSH, encode
 from policy.network.inference import Inference
-from policy.network.q_network import GRASP, PUSH
 from policy.network.weights import load_named
 from policy.training.learner import auc
 from policy.training.shard import Shard, unpack_height

@@ -17,9 +17,8 @@ from rich.progress import track
 
 from policy.finger_clearance import OpenGripper
 from policy.learned.graspability import Graspability
-from policy.network.encoding import encode
+from policy.network.encoding import PUSH, encode
 from policy.network.inference import Inference
-from policy.network.q_network import PUSH
 from policy.network.weights import load_named
 from policy.push.candidates import cells_with_start, push_candidates, pushable_cells
 from policy.push.line import free_to_descend, push_line

@@ -16,9 +16,8 @@ from rich.progress import track
 from policy.finger_clearance import OpenGripper
 from policy.learned.graspability import Graspability
 from policy.learned.policy import LearnedPolicy
-from policy.network.encoding import encode
+from policy.network.encoding import GRASP, PUSH, encode
 from policy.network.inference import Inference
-from policy.network.q_network import GRASP, PUSH
 from policy.network.weights import load_named
 from policy.push.candidates import pushable_cells
 from policy.push.line import push_line

@@ -1,5 +1,8 @@
 """The policies that go by name."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -11,6 +14,25 @@ from robotcell.motion.grasp import Grasp
 from tests.robotcell.maps import heightmap
 
 CONFIG = load_config()
+
+# Makes the policies of its arguments, lets them decide, and says which of the heavy packages that loaded.
+_LOADED = """
+import sys
+import numpy as np
+from policy import make_policy
+from robotcell.config import load_config
+from robotcell.jobs.policy_api import Observation, PickAny
+from robotcell.perception.heightmap import Heightmap
+config = load_config()
+heights = np.zeros(config.workspace.shape, np.float32)
+heights[100:125, 100:125] = 0.05
+labels = (heights > 0).astype(np.int32)
+color = np.full((*heights.shape, 3), 90, np.uint8)
+for name in sys.argv[1:]:
+    seen = Heightmap(config.workspace, color, heights, None, 1.0, {}, 0.0)
+    make_policy(name, config).decide(Observation(seen, labels, PickAny()))
+print(*(name for name in ("torch", "torch._dynamo", "torch._inductor", "sympy") if name in sys.modules))
+"""
 
 
 @pytest.mark.parametrize("name", ["learned", "grasp-only", "single-stage", "heuristic", "random"])
@@ -53,3 +75,15 @@ def test_an_unknown_policy_lists_those_that_exist():
         ConfigError, match="no policy is called 'best'; there is: grasp-only, heuristic, learned, random"
     ):
         make_policy("best", CONFIG)
+
+
+def test_a_policy_without_a_network_needs_no_torch():
+    told = subprocess.run(
+        [sys.executable, "-c", _LOADED, "heuristic", "random"], capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == []
+
+
+def test_deciding_loads_no_compiler_of_torch():
+    told = subprocess.run([sys.executable, "-c", _LOADED, "learned"], capture_output=True, text=True, check=True)
+    assert told.stdout.split() == ["torch"]

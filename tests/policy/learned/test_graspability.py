@@ -7,7 +7,7 @@ import pytest
 
 from policy.finger_clearance import OpenGripper
 from policy.learned.graspability import Graspability
-from policy.network.q_network import GRASP
+from policy.network.encoding import GRASP
 from policy.push.outcome import PushForwardModel, PushOutcome
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError

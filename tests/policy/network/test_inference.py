@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from policy.network import inference
-from policy.network.encoding import encode
+from policy.network.encoding import GRASP, PUSH, encode
 from policy.network.inference import Inference, fuse_norms
-from policy.network.q_network import GRASP, PUSH, QNetwork
+from policy.network.q_network import QNetwork
 from policy.network.weights import save_weights
 
 SIZE = 72
@@ -105,11 +104,11 @@ def test_a_push_in_direction_k_is_valued_by_what_lies_in_direction_k(rotation):
     assert values.tolist() == [float(k == rotation) for k in range(16)]
 
 
-def test_large_copies_pass_one_after_the_other(asked, monkeypatch):
+def test_large_copies_pass_one_after_the_other(network, asked):
     planes, objects = scene()
     whole = asked.maps(planes, objects, PUSH)
-    monkeypatch.setattr(inference, "_CELLS_AT_ONCE", 1)
-    np.testing.assert_allclose(asked.maps(planes, objects, PUSH), whole, atol=0.02)
+    one_by_one = Inference(network, cells_at_once=1)
+    np.testing.assert_allclose(one_by_one.maps(planes, objects, PUSH), whole, atol=0.02)
 
 
 def test_the_network_comes_from_a_file(network, asked, tmp_path):

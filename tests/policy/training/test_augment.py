@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from policy.network.encoding import encode
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import GRASP, PUSH, encode
 from policy.network.rotation import Copies
 from policy.training.augment import CROP_CELLS, crop
 from policy.training.replay import View

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import policy
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import GRASP, PUSH
 from policy.training.collect import Collection, collect
 from policy.training.config import CollectSettings
 from policy.training.shard import Shard, pack_height, unpack_height

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from policy.network.q_network import GRASP, PUSH, QNetwork
-from policy.training import augment
+from policy.network.encoding import GRASP, PUSH
+from policy.network.q_network import QNetwork
 from policy.training.collect import Collection
 from policy.training.config import CollectSettings, LearningSettings
 from policy.training.learner import Learner, auc
@@ -28,10 +28,8 @@ def torch_draws() -> None:
     torch.manual_seed(0)
 
 
-@pytest.fixture
-def small_crops(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bar's surroundings: those of the twin's objects are six times as many cells."""
-    monkeypatch.setattr(augment, "CROP_CELLS", 48)
+# A bar's surroundings: those of the twin's objects are six times as many cells.
+SMALL_CROP = 48
 
 
 class Planes(nn.Module):
@@ -275,12 +273,11 @@ def toy_replay() -> Replay:
     return make_replay(*(toy.collect(Collection(1, seeds, None, 1.0, settings)) for seeds in scenes))
 
 
-@pytest.mark.usefixtures("small_crops")
 def test_it_learns_what_the_picture_tells() -> None:
     """Across and along a bar, in scenes that it was never trained on."""
     replay, updates = toy_replay(), 120
     settings = LearningSettings(learning_rate=3e-3)
-    learner = Learner(QNetwork(), settings, stage=1, planned_updates=updates, seed=0)
+    learner = Learner(QNetwork(), settings, stage=1, planned_updates=updates, seed=0, crop_cells=SMALL_CROP)
     assert 0.3 < learner.validate(replay, 400)["grasp_auc"] < 0.7
     for _ in range(updates):
         learner.update(replay)
@@ -289,10 +286,11 @@ def test_it_learns_what_the_picture_tells() -> None:
     assert measured["push_auc"] > 0.9
 
 
-@pytest.mark.usefixtures("small_crops")
 def test_updates_can_be_repeated_from_a_saved_state() -> None:
     settings = LearningSettings(grasps=4, pushes=4)
-    first, again = (Learner(QNetwork(), settings, stage=1, planned_updates=6, seed=0) for _ in range(2))
+    first, again = (
+        Learner(QNetwork(), settings, stage=1, planned_updates=6, seed=0, crop_cells=SMALL_CROP) for _ in range(2)
+    )
     shard = make_shard([TRAINING] * 4, [(0, 1), (1, 2), (2, -1), (3, -1)])
     replay, same = make_replay(shard), make_replay(shard)
     first.look_ahead(replay, 0)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import GRASP, PUSH
 from policy.training.config import held_out
 from policy.training.replay import Replay
 from policy.training.shard import Shard

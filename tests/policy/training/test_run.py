@@ -15,7 +15,8 @@ import torch
 from policy.network.weights import load_weights
 from policy.training.checkpoint import load_checkpoint, save_checkpoint
 from policy.training.config import LearningSettings, StageSettings, TrainConfig
-from policy.training.run import prepare, read_metrics, train
+from policy.training.run import prepare, train
+from policy.training.run_folder import read_metrics
 from policy.training.shard import Shard
 from robotcell.errors import ConfigError, StorageError
 from tests.policy.training import toy

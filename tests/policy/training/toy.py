@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from policy.network.q_network import GRASP, PUSH
+from policy.network.encoding import GRASP, PUSH
 from policy.training.shard import Shard, pack_height
 
 if TYPE_CHECKING:

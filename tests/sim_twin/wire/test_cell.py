@@ -8,15 +8,12 @@ from multiprocessing.shared_memory import SharedMemory
 
 import pytest
 
-from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.cell import ServedCell
-from sim_twin.wire.control import handle
 from sim_twin.wire.faults import Fault, Kind
 from tests.processes import all_end
+from tests.sim_twin.wire.conftest import HOST, ONE
 
-HOST = "127.0.0.23"
-ONE = load_config(None, {"backend.options.objects": 1})
 LIMIT_S = 30.0
 # A supervisor as the command line is one, in a process of its own.
 SUPERVISOR = """
@@ -30,19 +27,6 @@ if __name__ == "__main__":
 """
 
 
-@pytest.fixture(scope="module")
-def shared_cell():
-    with ServedCell(ONE, HOST, modbus_port=0, camera_port=0) as cell:
-        yield cell
-
-
-@pytest.fixture
-def served(shared_cell):
-    """The shared cell, without faults."""
-    yield shared_cell
-    shared_cell.clear()
-
-
 def test_every_server_is_there_and_says_where(served):
     assert set(served.processes) == {"world", "ur", "compute box", "camera"}
     assert {"rtde", "dashboard", "modbus", "camera"} <= set(served.endpoints)
@@ -52,7 +36,6 @@ def test_every_server_is_there_and_says_where(served):
 
 def test_the_world_and_the_controller_live(served):
     state, command = served.state(), served.command()
-    assert handle(b'{"state": true}', served)["state"]["width_m"] == pytest.approx(0.08, abs=0.005)
     end = time.monotonic() + LIMIT_S
     while served.state()["t"] <= state["t"] or served.command()["tick"] <= command["tick"]:
         assert time.monotonic() < end

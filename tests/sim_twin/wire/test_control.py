@@ -4,19 +4,10 @@ import socket
 
 import pytest
 
-from robotcell.config import load_config
 from robotcell.errors import ConfigError, ConnectionLost
-from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.control import ControlSocket
 from sim_twin.wire.control_client import ask
-
-HOST = "127.0.0.26"
-
-
-@pytest.fixture
-def served():
-    """A cell that is not started: it keeps its faults, and has nobody to send them to."""
-    return ServedCell(load_config(None), HOST)
+from tests.sim_twin.wire.conftest import HOST
 
 
 @pytest.fixture
@@ -42,8 +33,7 @@ def test_it_obeys(served, control):
     assert "modbus wrong unit" in answer["exist"]["gripper"]
     assert ask(control.endpoint, {"clear": True}) == {"ok": True}
     assert served.faults == ()
-    with pytest.raises(ConfigError, match="not served"):
-        ask(control.endpoint, {"state": True})
+    assert ask(control.endpoint, {"state": True})["state"]["width_m"] == pytest.approx(0.08, abs=0.005)
 
 
 @pytest.mark.parametrize(
