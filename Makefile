@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' 2>/dev/null && echo $$p && break; done)
 
-.PHONY: demo test test-wire check bench setup clean
+.PHONY: demo test test-wire check bench docs setup clean
 
 demo: setup
 	$(BIN)/robotcell pick --goal red --cell examples/cell.toml
@@ -26,6 +26,15 @@ check: setup
 bench: setup
 	$(BIN)/python -m pytest tests/benchmarks --benchmark-enable --benchmark-only
 
+# The site, in site/. Broken links and every other warning are errors. Needs the network only to install, once.
+docs: $(VENV)/.docs-installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "site/index.html"
+
+$(VENV)/.docs-installed: $(VENV)/.installed
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[docs]'
+	@touch $@
+
 setup: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml
@@ -37,4 +46,4 @@ $(VENV)/.installed: pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build site *.egg-info .hypothesis .pytest_cache .mypy_cache .ruff_cache

@@ -65,7 +65,8 @@ def pick(
     objects: Objects = None,
     seed: Seed = None,
     policy: Annotated[
-        str | None, typer.Option(help="Who decides: learned, heuristic, grasp-only, random.", show_default=False)
+        str | None,
+        typer.Option(help="Who decides: learned, single-stage, grasp-only, heuristic, random.", show_default=False),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Look, decide, plan, check and draw one action; move nothing.")
@@ -144,7 +145,7 @@ def bench(
         Path | None, typer.Option(help="Folder of scene files to use instead.", show_default=False)
     ] = None,
     meshes: Annotated[
-        Path | None, typer.Option(help="Folder of the OBJ files that they name.", show_default=False)
+        Path | None, typer.Option(help="Folder of the mesh files that they name.", show_default=False)
     ] = None,
     cell: CellFile = None,
     settings: Settings = None,

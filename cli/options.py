@@ -34,7 +34,8 @@ Settings = Annotated[
     ),
 ]
 Scene = Annotated[
-    str | None, typer.Option(help="Twin: random, novel, challenging-01 to -10, or a scene file.", show_default=False)
+    str | None,
+    typer.Option(help="Twin: random, random-goal, novel, challenging-01 to -10, or a scene file.", show_default=False),
 ]
 Meshes = Annotated[
     Path | None, typer.Option(help="Twin: folder of the meshes that a scene file names.", show_default=False)

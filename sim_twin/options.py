@@ -15,7 +15,18 @@ if TYPE_CHECKING:
 
 
 class NoiseOptions(BaseModel):
-    """Which errors of the D415 the twin's camera shows."""
+    """Which errors of the D415 the twin's camera shows.
+
+    Attributes:
+        disparity_noise: noise of the disparity, so that depth noise grows with the square of the distance.
+        quantisation: depth comes in steps.
+        edge_bleeding: edges wander, and pixels hang between front and back.
+        dropout: pixels without depth, many where the surface is seen at a low angle.
+        occlusion: no depth where only one of the two imagers sees the surface.
+        warm_up: the exposure settles within the first 30 frames.
+        color_noise: blur and noise of the colour image.
+        white_balance: exposure and white balance wander.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -68,7 +79,7 @@ class TwinOptions(BaseModel):
         seed: of the scene and of the camera's noise; the same seed gives the same job.
         meshes: folder of the mesh files that a scene file names.
         noise: what the camera adds to the truth.
-        board: the gripper holds the calibration board (docs/calibration.md), a little differently for each seed.
+        board: the gripper holds the calibration board (docs/how-to/calibrate.md), a little differently for each seed.
         tag: a tag lies on the table beside the workspace, as one that is fixed to a cell (robotcell.perception.tags).
         camera_offset: how far the camera really stands from where `camera` has it without a calibration: position [m]
             and rotation vector [rad], base axes. A camera that was moved, or never measured.

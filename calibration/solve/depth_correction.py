@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
 
 MIN_SAMPLES = 50
-# A D415's depth error grows with the square of the distance (docs/twin-camera.md).
+# A D415's depth error grows with the square of the distance (docs/explanation/twin-camera.md).
 _HUBER = 2.0
 _ITERATIONS = 20
 # What is known before: a scale within 2 % and an offset within 10 mm (librealsense issues 3210 and 8075 report 1 % and

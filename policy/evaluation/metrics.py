@@ -1,4 +1,4 @@
-"""The figures of the paper's tables over trials, with 95 % intervals; docs/benchmark.md defines them."""
+"""The figures of the paper's tables over trials, with 95 % intervals; docs/explanation/benchmark.md defines them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The suites of the benchmark: which scenes, and what is to be picked from them (docs/benchmark.md)."""
+"""The suites of the benchmark: which scenes, and what is to be picked from them (docs/explanation/benchmark.md)."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _scene_files(folder: Path) -> list[Path]:
         if path.suffix.lower() in _SCENE_SUFFIXES and path.name != FRAMES_FILE and path.is_file()
     )
     if not files:
-        raise ConfigError(f"{folder}: no scene files in it; they end in .toml or .txt (docs/scenes.md)")
+        raise ConfigError(f"{folder}: no scene files in it; they end in .toml or .txt (docs/reference/scene-files.md)")
     return files
 
 

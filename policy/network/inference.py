@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 # How far around its cell a Q value depends on what stands there: the fingers' reach, and what a push meets first.
-# Copies that show more tell labelled attempts apart no better (`docs/policy.md`).
+# Copies that show more tell labelled attempts apart no better (`docs/explanation/experiments/networks.md`).
 MARGIN_M = 0.064
 _PLANES = {GRASP: GRASP_ROTATIONS, PUSH: ROTATIONS}
 # Cells of copies that pass the network at once: what the paper's network keeps of them takes 1 GB. Neither network is

@@ -24,7 +24,7 @@ _PUSHABLE_M = 0.030
 _SPACING_M = 0.006
 _TRIES = 400
 # The Q of a push loses so much by each metre that its way passes beside the centre of what it is to free
-# (`docs/policy.md`).
+# (`docs/explanation/experiments/push-ranking.md`).
 _OFF_CENTER_PER_M = 7.5
 # Of pushes whose ways are nearer to each other than this, one is predicted: they do much the same.
 _LANE_M = 0.020

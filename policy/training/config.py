@@ -35,8 +35,9 @@ class _Table(BaseModel):
 class CollectSettings(_Table):
     """How a scene is played."""
 
-    # Attempts of each primitive in every state, each from the same saved state.
+    # Grasps that are tried in every state, each from the same saved state.
     grasps: Annotated[int, Field(ge=0)] = 6
+    # Likewise pushes.
     pushes: Annotated[int, Field(ge=0)] = 6
     # States of a scene at most.
     states: Count = 6
@@ -45,13 +46,17 @@ class CollectSettings(_Table):
 class StageSettings(CollectSettings):
     """How long one stage is, how it explores, and how its scenes are played."""
 
+    # Rounds of the stage.
     rounds: Count
+    # Scenes that are played in a round.
     scenes_per_round: Count
+    # Updates of the network in a round.
     updates_per_round: Count
     # Rounds at the beginning that are played by exploration alone.
     warmup_rounds: Annotated[int, Field(ge=0)]
-    # Part of the attempts that explore: linear from the first round after the warm-up to the last.
+    # Part of the attempts that explore in the first round after the warm-up.
     exploration_start: Probability
+    # The same in the last round; linear in between.
     exploration_end: Probability
 
     @model_validator(mode="after")
@@ -69,18 +74,23 @@ class StageSettings(CollectSettings):
 class LearningSettings(_Table):
     """Double DQN with prioritised replay."""
 
-    # Attempts of each primitive in an update.
+    # Grasps in an update.
     grasps: Count = 32
+    # Pushes in an update.
     pushes: Count = 32
-    # Adam; follows half a cosine from the first to the last update of a stage.
+    # Of Adam at the first update of a stage; follows half a cosine from there to the last.
     learning_rate: Positive = 1e-3
+    # At the last update.
     final_learning_rate: Positive = 1e-4
+    # Gradients are clipped to it.
     gradient_norm: Positive = 5.0
-    # Paper: "gamma = 0.5".
+    # Discount. Paper: "gamma = 0.5".
     gamma: Annotated[float, Field(ge=0, lt=1)] = 0.5
-    # Exponents of prioritised replay; beta grows from its start to 1 over a stage.
+    # Exponent of prioritised replay.
     priority_alpha: Probability = 0.6
+    # Exponent of the importance weights at the start of a stage; it grows to 1.
     priority_beta_start: Probability = 0.4
+    # Weight of the loss of pushes.
     push_weight: Positive = 1.0
     # States after a push that are valued anew in a round, at least; all that were not valued yet come first.
     values_per_round: Count = 600
@@ -91,7 +101,9 @@ class LearningSettings(_Table):
 class TrainConfig(_Table):
     """A whole training run."""
 
+    # Another seed gives other scenes, other weights at the start and other draws.
     seed: Annotated[int, Field(ge=0, le=_MAX_SEED)] = 0
+    # "fast", or "paper": a large network, 60 times as long for an update, which takes 9 GB.
     architecture: str = "fast"
     # Scenes of training; evaluations use seeds below.
     first_seed: Annotated[int, Field(ge=1_000_000, le=100_000_000)] = 1_000_000
@@ -210,5 +222,5 @@ def _validated(values: dict[str, Any], place: str) -> TrainConfig:
     try:
         return TrainConfig.model_validate(values)
     except ValidationError as error:
-        problems = wrong_values(error, "docs/training.md")
+        problems = wrong_values(error, "docs/reference/training-file.md")
         raise ConfigError("\n  ".join([f"{place}: {len(problems)} wrong value(s)", *problems])) from None

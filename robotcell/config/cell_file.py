@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-_DOCS = "docs/configuration.md"
+_DOCS = "docs/reference/configuration.md"
 
 
 def load_config(

@@ -37,8 +37,11 @@ class Workspace(_Table):
     x = x_min + (col + 0.5) resolution, y = y_min + (row + 0.5) resolution.
     """
 
+    # The rectangle of the table that is worked on, along x of the base.
     x: Interval = (-0.724, -0.276)
+    # The same along y.
     y: Interval = (-0.224, 0.224)
+    # Side of a cell of the heightmap that `Cell.look` builds. A policy brings a map of its own.
     resolution_m: Annotated[float, Field(ge=0.0005, le=0.01)] = 0.002
 
     @property
@@ -62,23 +65,31 @@ class Workspace(_Table):
 class Table(_Table):
     """The table top: the plane z = height_m."""
 
+    # z of the table top.
     height_m: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
 
 
 class Bin(_Table):
     """The box that picked objects are dropped into."""
 
+    # x and y of the middle of the bin.
     center: tuple[float, float] = (-0.30, 0.45)
+    # Its outer sides along x and y.
     size: tuple[Positive, Positive] = (0.36, 0.30)
+    # Height of its walls above the table.
     wall_height_m: Annotated[float, Field(gt=0, le=0.5)] = 0.12
 
 
 class KeepOut(_Table):
     """A box that no part of arm, gripper or load may enter."""
 
+    # What errors call it.
     name: str
+    # Its extent along x of the base.
     x: Interval
+    # Its extent along y of the base.
     y: Interval
+    # Its extent along z of the base.
     z: Interval
 
     def corners(self) -> tuple[Array, Array]:
@@ -90,17 +101,23 @@ class KeepOut(_Table):
 class Motion(_Table):
     """How the arm moves. Speeds are those of the leading joint and of the tcp."""
 
-    # Tool upright beside the workspace, next to the bin: arm and gripper are 0.1 m out of the view of the workspace.
+    # Joint angles of the pose from which the camera sees the whole workspace. By default the tool stands upright
+    # beside the workspace, next to the bin: arm and gripper are 0.1 m out of the view.
     home_q: tuple[float, float, float, float, float, float] = (-0.8370, -1.4768, 1.2793, -1.3733, -1.5708, 0.7338)
+    # Speed of the leading joint.
     joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 1.5
-    # Universal Robots' default for movej.
+    # Acceleration of the leading joint; the default is Universal Robots' own for movej.
     joint_acceleration_rad_s2: Annotated[float, Field(gt=0, le=40)] = 1.4
+    # Speed of the tcp on straight lines.
     linear_speed_m_s: Annotated[float, Field(gt=0, le=1)] = 0.4
-    # Universal Robots' default for movel.
+    # Acceleration of the tcp on straight lines; the default is Universal Robots' own for movel.
     linear_acceleration_m_s2: Annotated[float, Field(gt=0, le=10)] = 1.2
-    # A finger that lands on a block is stopped at 30 to 85 N (measured in the twin; 90 N at 0.10, 75 N at 0.06).
+    # Speed of the last part of a descent, and of a push. A finger that lands on a block is stopped at 30 to 85 N
+    # (measured in the twin; 90 N at 0.10, 75 N at 0.06).
     guarded_speed_m_s: Annotated[float, Field(gt=0, le=0.25)] = 0.08
+    # Height of the approach above the end of a descent.
     approach_m: Annotated[float, Field(ge=0.02, le=0.4)] = 0.15
+    # Length of a push.
     push_m: Annotated[float, Field(ge=0.01, le=0.3)] = 0.10
     # A guarded descent that meets this force has met an object: it ends, and the grasp is given up.
     contact_force_n: Annotated[float, Field(gt=0, le=100)] = 30.0
@@ -113,37 +130,52 @@ class Motion(_Table):
 class Limits(_Table):
     """What the safety layer allows. It adds to the controller's own safety settings and never replaces them."""
 
-    # The tcp stays inside this box (the workspace, the bin and the way between them); z is above the table.
+    # The tcp stays inside a box (the workspace, the bin and the way between them): its extent along x of the base.
     x: Interval = (-0.80, 0.20)
+    # The box along y of the base.
     y: Interval = (-0.45, 0.65)
+    # The box in height above the table.
     z: Interval = (0.0, 0.70)
+    # Distance that every joint keeps from its limit.
     joint_margin_rad: Annotated[float, Field(ge=0, le=1)] = 0.05
+    # A plan with a faster joint is refused; an arm with a joint 5 % faster is stopped.
     joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 2.0
+    # The same for the tool.
     tool_speed_m_s: Annotated[float, Field(gt=0, le=3)] = 1.5
-    # Below the 150 N at which a UR5e's factory safety preset stops the arm.
+    # A force on the tool that stops the cell. The default is below the 150 N at which a UR5e's factory safety preset
+    # stops the arm.
     force_n: Annotated[float, Field(gt=0, le=250)] = 100.0
-    # Smallest singular value of the Jacobian.
+    # Smallest singular value of the Jacobian on straight lines.
     singularity: Annotated[float, Field(ge=0, le=0.2)] = 0.02
     # Distance that arm and gripper keep from keep-outs and from themselves.
     clearance_m: Annotated[float, Field(ge=0, le=0.1)] = 0.005
+    # An older state of the arm stops it.
     state_age_s: Annotated[float, Field(gt=0, le=1)] = 0.1
+    # An older frame is refused.
     frame_age_s: Annotated[float, Field(gt=0, le=5)] = 1.0
+    # Share of the workspace that the camera must see, gaps between pixels not counted as unseen.
     min_coverage: Annotated[float, Field(ge=0, le=1)] = 0.6
+    # The measured table may be tilted by this.
     max_tilt_rad: Annotated[float, Field(gt=0, le=0.2)] = 0.02
+    # The measured table may lie above or below `table.height_m` by this.
     max_table_offset_m: Annotated[float, Field(gt=0, le=0.05)] = 0.006
 
 
 class CameraMount(_Table):
     """The fixed camera: its mode, and where it stands, by a calibration, by a transform or by two points."""
 
+    # The mode of the camera: 640x480 or 1280x720. A calibration holds for one mode.
     resolution: Annotated[str, Field(pattern="^(640x480|1280x720)$")] = "640x480"
-    # 20 degrees off the vertical: the taller block of two hides little of the lower one, and the post stands clear.
+    # Where the camera stands. The default is 20 degrees off the vertical: the taller block of two hides little of the
+    # lower one, and the post stands clear.
     position: Vector3 = (-0.80, 0.0, 0.80)
+    # A point on the axis of the camera.
     look_at: Vector3 = (-0.5, 0.0, 0.0)
-    # T_base_camera, rows of a 4x4 matrix; stands above the two points when given.
+    # T_base_camera, rows of a 4x4 matrix (colour optical frame, OpenCV axes); stands above the two points.
     T_base_camera: tuple[tuple[float, ...], ...] | None = None
-    # A file that robotcell calibrate wrote; stands above the two points when given. A twin's camera really stands where
-    # the two points have it, and this file is what the program believes.
+    # A file that robotcell calibrate wrote, its path relative to the cell's file. It stands above the two points, and
+    # is refused beside T_base_camera. A twin's camera really stands where the points have it, and this file is what the
+    # program believes.
     calibration: Path | None = None
 
     _measured: CameraCalibration | None = PrivateAttr(None)
@@ -184,10 +216,11 @@ class CameraMount(_Table):
 class GripperUse(_Table):
     """How the gripper is used."""
 
-    # With 40 N, fingers that close on novel objects press too hard on what lies beneath more often than with 25 N
-    # (policy/data/MODEL_CARD.md); 25 N carries 1 kg at a friction of 0.2.
+    # Force of a finger. With 40 N, fingers that close on novel objects press too hard on what lies beneath more often
+    # than with 25 N (policy/data/MODEL_CARD.md); 25 N carries 1 kg at a friction of 0.2.
     force_n: Annotated[float, Field(ge=rg2.MIN_FORCE_N, le=rg2.MAX_FORCE_N)] = 25.0
-    # Narrower than the stroke: wide-open fingers collide with neighbours, and their tips draw back by 40 mm.
+    # Opening with which the fingers come down. It is narrower than the stroke: wide-open fingers collide with
+    # neighbours, and their tips draw back by 40 mm.
     preshape_m: Annotated[float, Field(gt=0, le=rg2.MAX_WIDTH_M)] = 0.080
     # Fingers closer than this hold nothing.
     empty_width_m: Annotated[float, Field(gt=0, le=0.05)] = 0.005
@@ -198,6 +231,7 @@ class GripperUse(_Table):
 class PolicyChoice(_Table):
     """Which policy decides."""
 
+    # learned, heuristic, grasp-only, single-stage or random.
     name: str = "learned"
 
 
@@ -206,6 +240,7 @@ class JournalPlace(_Table):
 
     # Any SQLAlchemy URL; by default a SQLite file in the folder of the runs.
     url: str | None = None
+    # Folder of the runs.
     runs: Path = Path("runs")
 
     @property
@@ -221,7 +256,9 @@ class JournalPlace(_Table):
 class BackendChoice(_Table):
     """Which devices stand behind the interfaces; the backend itself checks its options."""
 
+    # twin, hardware, or another entry point of the group robotcell.backends.
     name: str = "twin"
+    # Settings of the backend, which it checks itself.
     options: dict[str, Any] = {}
 
 

@@ -12,7 +12,7 @@ _LOG = logging.getLogger(__name__)
 def warn_unconfirmed(device: str) -> None:
     """Warn that the driver of a device was only ever run against the served twin."""
     _LOG.warning(
-        "the %s driver was verified against the served twin only, not yet against a device: follow 'First motion on a "
-        "new cell' in docs/hardware.md",
+        "the %s driver was verified against the served twin only, not yet against a device: follow "
+        "docs/tutorials/real-cell.md",
         device,
     )

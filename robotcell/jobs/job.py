@@ -60,7 +60,8 @@ def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, Che
     """Look, decide, plan and check one action; nothing moves.
 
     Raises:
-        ConfigError, NoTarget, UnsafeMotion and what `Cell.look` raises.
+        ConfigError, NoTarget, UnsafeMotion: as in a job.
+        ConnectionLost, DeviceFault, CalibrationError: as `Cell.look`.
     """
     check_config(cell.config)
     view = cell.look(policy.workspace)

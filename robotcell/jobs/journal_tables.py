@@ -35,18 +35,25 @@ class Job(Base):
 
     __tablename__ = "jobs"
 
+    # The job's number.
     id: Mapped[int] = mapped_column(primary_key=True)
+    # UTC.
     started: Mapped[datetime]
+    # UTC; null while the job runs, and of one that was killed.
     ended: Mapped[datetime | None]
     # Colours in order, or null for pick-all.
     goals: Mapped[list[str] | None] = mapped_column(JSON)
+    # Who decided.
     policy: Mapped[str]
+    # Every setting of the cell but journal.url, which may hold a password.
     config: Mapped[dict[str, Any]] = mapped_column(JSON)
+    # Folder of the run.
     run_dir: Mapped[str]
-    # running, complete, incomplete or stopped
+    # running, complete, incomplete or stopped.
     status: Mapped[str] = mapped_column(default="running")
+    # Why it is not complete.
     reason: Mapped[str] = mapped_column(default="")
-    # Duration on the cell's clock.
+    # Duration on the cell's clock [s].
     cell_s: Mapped[float | None]
     actions: Mapped[list[ActionRow]] = relationship(back_populates="job", order_by="ActionRow.id")
 
@@ -56,14 +63,23 @@ class Frame(Base):
 
     __tablename__ = "frames"
 
+    # The frame's number in the journal.
     id: Mapped[int] = mapped_column(primary_key=True)
+    # The job that it belongs to.
     job_id: Mapped[int] = mapped_column(ForeignKey("jobs.id"))
+    # The camera's own number.
     number: Mapped[int]
+    # Time of the capture on the cell's clock [s].
     t: Mapped[float]
+    # PNG, RGB.
     color_file: Mapped[str]
+    # PNG, 16 bit, 0.1 mm; 0 = no return.
     depth_file: Mapped[str]
+    # Share of the map's cells into which a return fell.
     coverage: Mapped[float]
+    # Tilt of the table as it was measured.
     tilt_rad: Mapped[float]
+    # Height of the table over the configured one, as it was measured.
     offset_m: Mapped[float]
 
 
@@ -72,21 +88,31 @@ class ActionRow(Base):
 
     __tablename__ = "actions"
 
+    # The action's number in the journal.
     id: Mapped[int] = mapped_column(primary_key=True)
+    # The job that it belongs to.
     job_id: Mapped[int] = mapped_column(ForeignKey("jobs.id"))
+    # The frame that it was decided on.
     frame_id: Mapped[int] = mapped_column(ForeignKey("frames.id"))
+    # The word of the goal that it was for; null for any object.
     goal: Mapped[str | None]
+    # grasp or push.
     primitive: Mapped[str]
+    # Index k of the direction: k * 22.5 degrees about base z.
     rotation: Mapped[int]
-    # Of a grasp its middle, of a push its start; base frame.
+    # Of a grasp its middle, of a push its start; base frame [m].
     x: Mapped[float]
+    # See x.
     y: Mapped[float]
-    # Height above the table: of the surface that is grasped, or of the top of what is pushed.
+    # Height above the table [m]: of the surface that is grasped, or of the top of what is pushed.
     surface_m: Mapped[float]
-    # Of a push only, and not known of pushes of the first schema.
+    # Where a push ends, base frame [m]; null for grasps, and for pushes of the first schema.
     end_x: Mapped[float | None]
+    # See end_x.
     end_y: Mapped[float | None]
+    # What the policy expected of it.
     q_value: Mapped[float]
+    # Time of the start on the cell's clock [s].
     started_s: Mapped[float]
     job: Mapped[Job] = relationship(back_populates="actions")
     frame: Mapped[Frame] = relationship()
@@ -98,15 +124,21 @@ class OutcomeRow(Base):
 
     __tablename__ = "outcomes"
 
+    # The action that it is of.
     action_id: Mapped[int] = mapped_column(ForeignKey("actions.id"), primary_key=True)
+    # In a word, such as picked or missed.
     result: Mapped[str]
+    # Whether the action did what it was for.
     success: Mapped[bool]
     # Colour of the object that left the table.
     picked: Mapped[str | None]
+    # In a sentence.
     detail: Mapped[str]
-    # Contact forces of guarded motions and of the fingers; null where they are not known.
+    # Largest contact force of guarded motions; null where it is not known.
     peak_force_n: Mapped[float | None]
+    # Largest contact force while the fingers moved; null where it is not known.
     grip_force_n: Mapped[float | None]
+    # Time of the end on the cell's clock [s].
     ended_s: Mapped[float]
     action: Mapped[ActionRow] = relationship(back_populates="outcome")
 

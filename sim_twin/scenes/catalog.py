@@ -51,7 +51,7 @@ def make_scene(
     """Make the scene of that name.
 
     Args:
-        name: one of `scene_names()`, or the path of a scene file (see docs/scenes.md).
+        name: one of `scene_names()`, or the path of a scene file (see docs/reference/scene-files.md).
         count: number of objects of `random`, `random-goal` and `novel`; the other scenes have their own.
         seed: of what those three draw.
         workspace: where the scene is put.

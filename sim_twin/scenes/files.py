@@ -1,7 +1,7 @@
 """Scenes from files: the twin's own TOML format, and the two text formats of the published block scenes.
 
-docs/scenes.md describes all three. Metres, radians; a scene's frame has x and y from the centre of the workspace
-and z from the table top.
+docs/reference/scene-files.md describes all three. Metres, radians; a scene's frame has x and y from the centre of the
+workspace and z from the table top.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def mesh_frame(mesh: Mesh) -> Array:
 
     Its columns are the principal axes of inertia: x that of the largest moment, z that of the smallest. Equal
     moments leave the mesh's own axes where they are, as far as they can be; x and y point along the mesh axis
-    nearest to them, never against it. The rule was fitted to published scenes (docs/scenes.md).
+    nearest to them, never against it. The rule was fitted to published scenes (docs/reference/scene-files.md).
     """
     moments, axes = np.linalg.eigh(mesh_inertia(mesh))
     moments, axes = moments[::-1], axes[:, ::-1]
@@ -219,7 +219,7 @@ def _read_rows(path: Path, text: str, meshes: Path | None) -> Scene:
     lines = [(n, fields) for n, line in enumerate(text.splitlines(), start=1) if (fields := line.split())]
     lines = [(number, fields) for number, fields in lines if not fields[0].startswith("#")]
     if not lines:
-        raise ConfigError(f"{path}: holds no objects; see docs/scenes.md for the formats")
+        raise ConfigError(f"{path}: holds no objects; see docs/reference/scene-files.md for the formats")
     widths = {10: _vpg_row, 8: _named_row}
     width = len(lines[0][1])
     if width not in widths:

@@ -1,7 +1,7 @@
 """The running engine of a world, and what is loaded in it.
 
 Settings by experiment (240 Hz, 50 solver iterations, gear constraint, rolling friction, maximal coordinates and
-sleeping for objects): docs/twin.md lists them with what they are good for.
+sleeping for objects): docs/explanation/twin.md lists them with what they are good for.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Views from files: pose pairs and corners of other programs. Every mistake names the file, the view and the field.
 
 pairs.json is a list of [T_base_flange, T_camera_board], 4x4 matrices in metres. corners.json holds "mount", "camera",
-"board" and "views" (docs/calibration-method.md shows one). A session folder is read by `calibration.collect.session`.
+"board" and "views" (docs/how-to/solve-recorded-data.md shows one). A session folder is read by
+`calibration.collect.session`.
 """
 
 from __future__ import annotations

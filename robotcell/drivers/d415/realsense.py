@@ -18,7 +18,8 @@ USB_ADVICE = (
     "with the camera), and plug it in again"
 )
 _ABSENT_ADVICE = (
-    "check the cable, that `lsusb` lists Intel RealSense, and that its udev rules are installed (docs/hardware.md)"
+    "check the cable, that `lsusb` lists Intel RealSense, and that its udev rules are installed "
+    "(docs/how-to/install-hardware.md)"
 )
 
 

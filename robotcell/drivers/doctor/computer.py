@@ -37,5 +37,8 @@ def _examine_udev() -> Finding:
             text = path.read_text(encoding="utf-8", errors="replace").lower()
             if all(number in text for number in _UDEV_IDS):
                 return Finding("computer", "udev rule", str(path))
-    cure = "install the camera's udev rule as docs/hardware.md says; without it only root can open the camera"
+    cure = (
+        "install the camera's udev rule as docs/how-to/install-hardware.md says; without it only root can open the "
+        "camera"
+    )
     return Finding("computer", "udev rule", "missing", Grade.WRONG, cure)

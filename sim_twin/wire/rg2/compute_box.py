@@ -1,7 +1,7 @@
 """The OnRobot Compute Box with an RG2: its register map over Modbus TCP, in a process of its own.
 
 After OnRobot's "Connectivity Guide for Modbus RTU and TCP", as public drivers quote and use it. What the guide leaves
-open, and was decided here, is listed in docs/served-twin.md.
+open, and was decided here, is listed in docs/reference/served-gripper.md.
 """
 
 from __future__ import annotations

@@ -19,12 +19,6 @@ def test_without_a_file_the_twin_stands_ready() -> None:
     assert config.policy.name == "learned"
 
 
-def test_the_example_shows_the_defaults() -> None:
-    example, default = load_config(EXAMPLE), load_config()
-    of_its_own = {"backend": True, "camera": {"calibration": True}}
-    assert example.model_dump(exclude=of_its_own) == default.model_dump(exclude=of_its_own)
-
-
 def test_a_relative_calibration_file_lies_beside_the_cells_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
