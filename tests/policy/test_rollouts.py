@@ -136,9 +136,9 @@ def test_somebody_has_to_do_the_work(workers: int) -> None:
 
 RAY = """
 import psutil
-from policy.parallel import run_tasks
+from policy.rollouts import run_tasks
 from robotcell.errors import ConfigError
-from tests.policy.test_parallel import refuse_three
+from tests.policy.test_rollouts import refuse_three
 
 results = []
 try:
