@@ -18,7 +18,6 @@ from robotcell.geometry.ur5e import inverse
 from robotcell.motion.executor import Ending
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, LinearMove, MotionPlan, Step, joint_move
-from robotcell.motion.retreat import plan_retreat
 from robotcell.motion.tool import flange_pose, tool_down
 from robotcell.perception.heightmap import Heightmap, TablePlane, build_heightmap
 
@@ -138,7 +137,7 @@ def verify(
     """
     if not consent():
         raise ConfigError("nothing was moved")
-    go_home(cell)
+    cell.home()
     table, spots = choose_spots(cell, count)
     touches = []
     for number, spot in enumerate(spots, 1):
@@ -148,7 +147,7 @@ def verify(
             go_above(cell, spot, HOVER_M)
             hovering(number, len(spots), spot)
             touches.append(Touch(spot))
-    go_home(cell)
+    cell.home()
     return Verification(table, tuple(touches))
 
 
@@ -234,15 +233,6 @@ def touch_table(cell: Cell, spot: Array) -> Touch:
             f"x {spot[0]:.3f}, y {spot[1]:.3f} m: check table.height_m, then calibrate again"
         )
     return Touch(spot, float(met))
-
-
-def go_home(cell: Cell) -> None:
-    """Straight up, open the fingers, home.
-
-    Raises:
-        UnsafeMotion, GuardTripped, DeviceFault, ConnectionLost: as path check, guard and devices do.
-    """
-    cell.executor.run(check_path(plan_retreat(cell.arm.state(), cell.config), cell.config))
 
 
 def _bare(heights: npt.NDArray[np.floating], heightmap: Heightmap) -> npt.NDArray[np.bool_]:

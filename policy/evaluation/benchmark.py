@@ -26,7 +26,7 @@ from policy.evaluation.trials import Failure, Trial, TrialResult, run_trial
 from policy.rollouts import run_tasks
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
-from robotcell.io.atomic_file import make_folder, write_whole
+from robotcell.io.atomic_file import make_folder, replaced, write_whole
 from robotcell.jobs.run_folder import make_run_dir
 from robotcell.motion.config_check import check_config
 
@@ -189,7 +189,7 @@ def run(
         _drop_half_line(file)
         for _index, (result, pictures) in tasks:
             for name, jpeg in pictures.items():
-                (folder / PICTURES / name).write_bytes(jpeg)
+                _write_picture(folder / PICTURES / name, jpeg)
             file.write((json.dumps(asdict(result)) + "\n").encode())
             file.flush()
             yield result
@@ -225,6 +225,11 @@ def write_json(path: Path, settings: Settings, origin: Origin, results: Sequence
 
 def _result(values: dict[str, Any]) -> TrialResult:
     return TrialResult(**{**values, "shown": tuple(Failure(**failure) for failure in values["shown"])})
+
+
+def _write_picture(path: Path, jpeg: bytes) -> None:
+    with replaced(path) as part:
+        part.write_bytes(jpeg)
 
 
 def _drop_half_line(file: Any) -> None:

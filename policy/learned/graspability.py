@@ -77,7 +77,7 @@ class Graspability:
         if label not in self._objects:
             resolution_m = self._heightmap.workspace.resolution_m
             own, seen = self._labels == label, self._heightmap.color
-            bare = np.where(own, self._heightmap.filled(), np.float32(0))
+            bare = np.where(own, self._heightmap.filled_m, np.float32(0))
             table = self._labels == 0
             color = np.median(seen[table], axis=0) if table.any() else np.zeros(3)
             planes = encode(bare, np.where(own[..., None], seen, color.astype(np.uint8)))

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robotcell.geometry import rg2
-from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.rotations import rotation_angle_rad
 from robotcell.perception.segmentation import MIN_OBJECT_M
 
 if TYPE_CHECKING:
@@ -171,5 +171,5 @@ def normal(rotation: int) -> Array:
 
 def _direction(rotation: int) -> Array:
     """Steps in rows, which run along y, and in columns, which run along x."""
-    theta = 2 * math.pi * rotation / ROTATIONS
+    theta = rotation_angle_rad(rotation)
     return np.array([math.sin(theta), math.cos(theta)])

@@ -13,7 +13,7 @@ from scipy.ndimage import find_objects
 
 from policy.push.border import border_cells, is_occupied
 from policy.push.physics import PlanarPhysics, Prism
-from robotcell.motion.rotations import ROTATIONS
+from robotcell.motion.rotations import rotation_angle_rad
 from robotcell.perception.heightmap import upper_height
 from robotcell.perception.segmentation import MIN_OBJECT_M
 
@@ -74,7 +74,7 @@ class PushForwardModel:
     """
 
     def __init__(self, labels: npt.NDArray[np.integer], heightmap: Heightmap) -> None:
-        self._height_m = heightmap.filled()
+        self._height_m = heightmap.filled_m
         self._seen = np.isfinite(heightmap.height_m)
         self._resolution_m = heightmap.workspace.resolution_m
         self._pad = math.ceil(_AROUND_M / self._resolution_m)
@@ -91,7 +91,7 @@ class PushForwardModel:
         start = (np.array([line.col, line.row]) + 0.5) * self._resolution_m
         length_m = (len(line.cells) - 1) * self._resolution_m
         # The paper pushes at half of the height of what is met.
-        moves = self._physics.push(start, 2 * math.pi * rotation / ROTATIONS, length_m, line.top_m / 2 + _CLEAR_M)
+        moves = self._physics.push(start, rotation_angle_rad(rotation), length_m, line.top_m / 2 + _CLEAR_M)
         lost = frozenset(i for i, move in moves.items() if self._may_be_lost(self._prisms[i], move))
         return PushOutcome(moves, lost)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from robotcell.jobs.policy_api import Task
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
     from robotcell.perception.view import View
@@ -21,12 +22,14 @@ class Decision:
         index: number of the action in its job, from 1.
         goal: the word of the goal that it is for; None for any object.
         view: what it was decided on.
+        task: what was to be done.
         action: grasp or push.
     """
 
     index: int
     goal: str | None
     view: View
+    task: Task
     action: Action
 
 

@@ -65,9 +65,10 @@ def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, Che
     """
     check_config(cell.config)
     view = cell.look(policy.workspace)
-    action = policy.decide(_observe(view, _task(view, goal, None), (), may_push=True))
+    task = _task(view, goal, None)
+    action = policy.decide(_observe(view, task, (), may_push=True))
     plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
-    return Decision(1, goal, view, action), check_path(plan, cell.config)
+    return Decision(1, goal, view, task, action), check_path(plan, cell.config)
 
 
 def run_job(
@@ -162,7 +163,7 @@ class _Job:
                 return view, str(error)
             if isinstance(task, PickGoal):
                 place = task.mask
-            view, outcome = self._act(goal, view, action)
+            view, outcome = self._act(goal, view, task, action)
             if place is not None:
                 place = place_after(place, action, outcome.result, view.heightmap.workspace)
             if not isinstance(task, Uncover):
@@ -180,10 +181,10 @@ class _Job:
                 return view, f"given up after {failures} failed attempts in a row, the last one: {outcome.detail}"
         return view, ""
 
-    def _act(self, goal: str | None, view: View, action: Action) -> tuple[View, Outcome]:
+    def _act(self, goal: str | None, view: View, task: Task, action: Action) -> tuple[View, Outcome]:
         """Run one action between its two rows of the journal; the view after it."""
         self.actions += 1
-        decision = Decision(self.actions, goal, view, action)
+        decision = Decision(self.actions, goal, view, task, action)
         frame_id = self.journal.add_frame(
             frame_row(self.job_id, view.frame, view.heightmap, save_frame(view.frame, self.run_dir))
         )

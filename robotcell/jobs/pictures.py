@@ -13,8 +13,8 @@ from PIL import Image
 from robotcell.errors import StorageError
 from robotcell.geometry import rg2
 from robotcell.io.images import write_image
+from robotcell.jobs.policy_api import PickAny
 from robotcell.motion.grasp import Grasp
-from robotcell.perception.goals import goal_color
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 
 if TYPE_CHECKING:
@@ -100,11 +100,7 @@ def draw_decision(
     decision: Decision, config: CellConfig, caption: str, color: tuple[int, int, int] = _NEUTRAL
 ) -> _Picture:
     """A page (H, W, 3) uint8 RGB of a decision: camera view, heightmap with the action, heights."""
-    labels = decision.view.segmentation.labels
-    goal = None
-    if decision.goal is not None:
-        chosen = [i.label for i in decision.view.segmentation.instances if i.color_name == goal_color(decision.goal)]
-        goal = np.isin(labels, chosen)
+    goal = None if isinstance(decision.task, PickAny) else decision.task.mask
     return draw_view(decision.view, decision.action, goal, config, caption, color)
 
 

@@ -89,15 +89,18 @@ class Heightmap:
         closed.flags.writeable = False
         return closed
 
-    def filled(self) -> npt.NDArray[np.float32]:
-        """The heights (H, W) [m] without NaN, for what cannot work with unknown cells.
+    @cached_property
+    def filled_m(self) -> npt.NDArray[np.float32]:
+        """The heights (H, W) [m] without NaN, for what cannot work with unknown cells; read-only.
 
         Gaps between pixels take the highest of their neighbours (`close_gaps`), so that they close at the height
         of what surrounds them. What is still unknown (the shadow behind an object, the world beyond the image)
         takes the table's level 0, the only value that does not invent an object. Whoever plans a motion must
         therefore ask `height_m` whether a cell was seen at all.
         """
-        return np.nan_to_num(self.closed_m, nan=0.0)
+        filled = np.nan_to_num(self.closed_m, nan=0.0)
+        filled.flags.writeable = False
+        return filled
 
 
 def close_gaps(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -83,7 +83,7 @@ class Segmentation:
 
 def object_mask(heightmap: Heightmap, min_height_m: float = MIN_OBJECT_M) -> npt.NDArray[np.bool_]:
     """(H, W) cells that rise at least `min_height_m` above the table, without specks."""
-    high = (heightmap.filled() >= min_height_m).astype(np.uint8)
+    high = (heightmap.filled_m >= min_height_m).astype(np.uint8)
     opened = cv2.morphologyEx(high, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, patches = cv2.connectedComponents(opened, connectivity=4)
     seen = np.bincount(patches[np.isfinite(heightmap.height_m)], minlength=count)
@@ -99,7 +99,7 @@ def segment(heightmap: Heightmap) -> Segmentation:
         return Segmentation(np.zeros(objects.shape, np.int32), ())
     resolution = heightmap.workspace.resolution_m
     colors = _colors(heightmap, objects)
-    labels = _components(colors, objects, _height_steps(heightmap.filled()))
+    labels = _components(colors, objects, _height_steps(heightmap.filled_m))
     labels = _split_necks(labels, resolution)
     labels = _merge_fragments(labels, resolution)
     return _describe(labels, heightmap)

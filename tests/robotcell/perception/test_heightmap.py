@@ -113,7 +113,7 @@ def test_a_frame_without_returns_shows_nothing():
     assert np.isnan(result.height_m).all()
     assert result.coverage == 0
     assert result.table is None
-    assert not result.filled().any()
+    assert not result.filled_m.any()
 
 
 def test_what_is_over_the_cap_leaves_the_table_below_unknown():
@@ -140,10 +140,10 @@ def test_filling_closes_gaps_and_leaves_shadows_at_the_table():
     heights[120, 120] = np.nan  # and on the table
     heights[50:75, 75:90] = np.nan  # the object's shadow
     seen = heightmap(heights)
-    filled = seen.filled()
+    filled = seen.filled_m
     filled[0, 0] = 9.0  # a copy of its own
     assert np.isnan(seen.closed_m[52:73, 76:90]).all()
-    assert not seen.filled()[0, 0]
+    assert not seen.filled_m[0, 0]
     with pytest.raises(ValueError, match="read-only"):
         seen.closed_m[0, 0] = 9.0
     assert np.isfinite(filled).all()
