@@ -137,6 +137,10 @@ def _quiet(path: Path) -> Iterator[None]:
         raise ConfigError(
             f"mesh files need trimesh and its readers ({error}): pip install 'robotcell[twin]'"
         ) from error
+    except IndexError as error:
+        raise ConfigError(
+            f"{path}: a face names a vertex that is not in the file ({error}); export the mesh again"
+        ) from error
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
         raise ConfigError(

@@ -103,8 +103,12 @@ def test_the_goal_of_a_scene_file_is_found(tmp_path: Path, meshes: Path, rows: s
         ("red plank.obj -0.5 0 high 0 0 0", PLANK, "scene.txt, line 1: z is 'high', which is no number"),
         ("red board.obj -0.5 0 0 0 0 0", PLANK, "scene.txt, line 1: there is no board.obj"),
         ("red plank.obj -0.5 0 0 0 0 0", PLANK.replace("f 1 2 6 5\n", ""), "plank.obj: the surface is flat or not"),
-        ("red plank.obj -0.5 0 0 0 0 0", PLANK + "f 1 2 99\n", "plank.obj, line 15: the face names vertex 99"),
-        ("red plank.obj -0.5 0 0 0 0 0", PLANK.replace("0.05", "50"), "plank.obj: extent 100 m; OBJ files are read in"),
+        (
+            "red plank.obj -0.5 0 0 0 0 0",
+            PLANK + "f 1 2 99\n",
+            "plank.obj: a face names a vertex that is not in the file",
+        ),
+        ("red plank.obj -0.5 0 0 0 0 0", PLANK.replace("0.05", "50"), "plank.obj: extent 100 m; it is read in metres"),
     ],
 )
 def test_a_bad_row_or_mesh_ends_the_command_with_the_reason(
