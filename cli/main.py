@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from cli.calibrate import app as calibrate_app
+from cli.jobs import app as jobs_app
 from cli.options import CellChoice, CellFile, Meshes, Objects, Scene, Seed, Settings, Verbose
+from cli.served_twin import app as twin_app
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -25,11 +27,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-jobs_app = typer.Typer(help="What past jobs did.", invoke_without_command=True, pretty_exceptions_enable=False)
 app.add_typer(jobs_app, name="jobs")
-twin_app = typer.Typer(
-    help="The simulated cell behind the devices' own protocols.", no_args_is_help=True, pretty_exceptions_enable=False
-)
 app.add_typer(twin_app, name="twin")
 app.add_typer(calibrate_app, name="calibrate")
 
@@ -214,106 +212,6 @@ def recover(
     from cli.doctor import run_recover
 
     raise typer.Exit(run_recover(CellChoice(cell, settings), yes=yes))
-
-
-@jobs_app.callback()
-def jobs(
-    context: typer.Context,
-    cell: CellFile = None,
-    settings: Settings = None,
-    limit: Annotated[int, typer.Option(min=1, help="How many of the newest jobs.")] = 20,
-    verbose: Verbose = False,
-) -> None:
-    """List the newest jobs."""
-    if context.invoked_subcommand is None:
-        from cli.history import list_jobs
-
-        raise typer.Exit(list_jobs(CellChoice(cell, settings), limit))
-
-
-@jobs_app.command()
-def show(
-    job: Annotated[int, typer.Argument(help="The job's number.")],
-    cell: CellFile = None,
-    settings: Settings = None,
-    verbose: Verbose = False,
-) -> None:
-    """Print one job: its actions, what came of them, and its metrics."""
-    from cli.history import show_job
-
-    raise typer.Exit(show_job(CellChoice(cell, settings), job))
-
-
-@twin_app.command()
-def serve(
-    host: Annotated[str, typer.Option(help="Address on which everything listens.")] = "127.0.0.2",
-    modbus_port: Annotated[int, typer.Option(min=0, max=65535, help="Of the Compute Box.")] = 1502,
-    camera_port: Annotated[int, typer.Option(min=0, max=65535, help="Of the camera's frames.")] = 30415,
-    control_port: Annotated[
-        int | None,
-        typer.Option(min=0, max=65535, help="Of the control socket for faults; none unless given.", show_default=False),
-    ] = None,
-    cell: CellFile = None,
-    settings: Settings = None,
-    scene: Scene = None,
-    meshes: Meshes = None,
-    objects: Objects = None,
-    seed: Seed = None,
-    expose: Annotated[
-        bool, typer.Option("--expose", help="Listen on an address that other machines can reach.")
-    ] = False,
-    verbose: Verbose = False,
-) -> None:
-    """Serve a UR5e, an RG2 and a D415 in real time, for any client that speaks their protocols, until interrupted.
-
-    Exit codes: 0 interrupted or terminated, 2 usage or configuration, 3 a server died.
-    """
-    from cli.twin import Ports, run_serve
-
-    options = {"--scene": scene, "--meshes": meshes, "--objects": objects, "--seed": seed}
-    ports = Ports(modbus_port, camera_port, control_port)
-    raise typer.Exit(run_serve(CellChoice(cell, settings, options), host, ports, expose=expose))
-
-
-@twin_app.command()
-def fault(
-    control: Annotated[str, typer.Option(help="Address of the control socket, host:port.")],
-    words: Annotated[list[str] | None, typer.Argument(metavar="DEVICE CHANNEL KIND [WHAT]")] = None,
-    value: Annotated[
-        float | None, typer.Option(help="Seconds, share or number that the fault needs.", show_default=False)
-    ] = None,
-    clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
-    list_: Annotated[bool, typer.Option("--list", help="Show which faults exist and which are on.")] = False,
-) -> None:
-    """Give a served cell a fault, such as: gripper modbus stuck.
-
-    Exit codes: 0 done, 2 no such fault, 3 nothing is served there.
-    """
-    from cli.twin import run_fault
-
-    raise typer.Exit(run_fault(words or [], value, control, clear=clear, show=list_))
-
-
-@twin_app.command()
-def record(
-    out: Annotated[Path, typer.Option(help="The .db3 file to write.")],
-    seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long.")] = 3.0,
-    cell: CellFile = None,
-    settings: Settings = None,
-    scene: Scene = None,
-    meshes: Meshes = None,
-    objects: Objects = None,
-    seed: Seed = None,
-    verbose: Verbose = False,
-) -> None:
-    """Record what the camera sees of a scene, for librealsense to play, or as camera.source of a cell.
-
-    Exit codes: 0 recorded, 2 usage or configuration, 3 the recording failed.
-    """
-    from cli.twin_record import run_record
-
-    options = {"--scene": scene, "--meshes": meshes, "--objects": objects, "--seed": seed}
-    raise typer.Exit(run_record(CellChoice(cell, settings, options), out, seconds))
 
 
 def _end(number: int, _frame: FrameType | None) -> NoReturn:
