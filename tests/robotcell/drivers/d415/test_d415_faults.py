@@ -24,9 +24,9 @@ OFF, STUCK, SLOW, DELAYED, INTERMITTENT = Kind.OFF, Kind.STUCK, Kind.SLOW, Kind.
 WRONG, GARBAGE = Kind.WRONG, Kind.GARBAGE
 NO_FRAME, NO_DEPTH = "no frame came within 1 s", "nothing in the image has depth"
 ONLY_ANOTHER = f"{SERIAL} is not connected, only {WRONG_SERIAL}"
-# Each fault, and the error and words that it comes to: for a look at the table while the stream runs, and for connecting
-# while it lasts. A camera of wrong depth can be connected to; a slow stream needs two seconds for three frames, which is
-# neither an error nor worth waiting for.
+# Each fault, and the error and words that it comes to: for a look at the table while the stream runs, and for
+# connecting while it lasts. A camera of wrong depth can be connected to; a slow stream needs two seconds for three
+# frames, which is neither an error nor worth waiting for.
 FAULTS = [
     ("stream", OFF, "", None, ConnectionLost, NO_FRAME, ConnectionLost, "robotcell twin serve"),
     ("stream", STUCK, "", None, DeviceFault, "frozen", DeviceFault, "frozen"),
