@@ -148,7 +148,7 @@ def test_it_does_not_matter_how_the_stream_is_cut(parts: list[bytes], cuts: list
     assert shown([one for a, b in itertools.pairwise(edges) for one in received(stream[a:b], reader)]) == whole
 
 
-WORDS = st.sampled_from(rb"def p(): sec s(): if x: end stopj(2) halt # \" ' ( )".split(b" ") + [b"\n"])
+WORDS = st.sampled_from([*rb"def p(): sec s(): if x: end stopj(2) halt # \" ' ( )".split(b" "), b"\n"])
 
 
 @given(st.one_of(st.binary(max_size=400), st.lists(WORDS, max_size=60).map(b" ".join)))
