@@ -261,9 +261,11 @@ def test_a_dashboard_client_that_closes_at_once_is_obeyed(served: ServedControll
 
 def messages(primary: socket.socket, *kinds: int) -> list[bytes]:
     """The next robot message of each kind, in this order, without its head."""
-    found = []
+    found: list[bytes] = []
+    end = time.monotonic() + 10
     for wanted in kinds:
         while True:
+            assert time.monotonic() < end, f"no message of type {wanted} after {found}"
             kind, body = stream_message(primary)
             if kind == 20 and body[9] == wanted:
                 assert body[8] == 0xFD
