@@ -61,8 +61,8 @@ def _one_at_a_time(file: Path | None) -> Iterator[None]:
     """Wait until no other process makes or migrates a SQLite file of this folder.
 
     SQLite cannot hold the others off by itself: of two connections that give a new file its write-ahead log at once,
-    one fails at once, whatever its time-out. The lock is on the folder, since closing the file itself would end the locks
-    that SQLite has on it.
+    one fails at once, whatever its time-out. The lock is on the folder, since closing the file itself would end the
+    locks that SQLite has on it.
     """
     if file is None:
         yield
