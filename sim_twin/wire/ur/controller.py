@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_twin.devices.arm import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
+from sim_twin.devices.arm_limits import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
 from sim_twin.wire.shared_state import PERIOD_S
 from sim_twin.wire.ur.arm import Arm
 from sim_twin.wire.ur.history import History

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.geometry import ur5e
-from sim_twin.devices.arm import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
+from robotcell.geometry.transforms import matrix_to_rotvec
+from sim_twin.devices.arm_limits import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
 from sim_twin.devices.trajectory import Trapezoid
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.pose import displaced, pose_to_matrix, rotation_vector
+from sim_twin.wire.ur.pose import displaced, pose_to_matrix
 from sim_twin.wire.ur.program import ScriptError, Thread
 from sim_twin.wire.ur.stops import stop_joints
 
@@ -142,7 +143,7 @@ class _LineLeg:
         self.t = 0.0
         self._T_start, self._T_goal = arm.forward(q_start), T_goal
         self.way = T_goal[:3, 3] - self._T_start[:3, 3]
-        self.turn = np.array(rotation_vector(T_goal[:3, :3] @ self._T_start[:3, :3].T))
+        self.turn = matrix_to_rotvec(T_goal[:3, :3] @ self._T_start[:3, :3].T)
         self._blend_m = move.blend_m
         length, turn = float(np.linalg.norm(self.way)), float(np.linalg.norm(self.turn))
         distance = max(length, turn * ROTATION_LEVER_M)
