@@ -31,6 +31,8 @@ GRASP_DEPTH_M = 0.040
 LOAD_REACH_M = 0.060
 # Label of the first check for a held object; one that passes here and fails later was lost on the way.
 HELD_AFTER_LIFT = "held after the lift"
+# Label of the second one; what passes here is let go into the bin next.
+HELD_OVER_BIN = "held over the bin"
 # A load is lifted until it would pass this high over the walls of the bin.
 _CARRY_CLEARANCE_M = 0.03
 # The finger tips are this high over the walls of the bin when they let go.
@@ -80,12 +82,9 @@ def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellC
     # The symmetric jaw may have been turned by half a turn to stay near the home pose.
     T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
     T_near, T_grasp, T_lifted = (T_above.copy() for _ in range(3))
-    T_lifted[2, 3] = max(approach_z, table + config.bin.wall_height_m + LOAD_REACH_M + _CARRY_CLEARANCE_M)
+    T_lifted[2, 3] = max(approach_z, table + carry_height(config))
     T_near[2, 3] = near_height(heightmap, grasp.x, grasp.y, grasp.theta, use.preshape_m, tcp_z, config)
     T_grasp[2, 3] = tcp_z
-    bin_x, bin_y = _release_point(grasp.x, grasp.y, config)
-    bin_z = table + config.bin.wall_height_m + _BIN_CLEARANCE_M
-    q_bin = solve_tool_down("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
     steps: tuple[Step, ...] = (
         Grip("pre-shape", use.preshape_m, use.force_n),
         joint_move("approach", q_above, config),
@@ -94,12 +93,36 @@ def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellC
         Grip("close", rg2.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
         LinearMove("lift", T_lifted, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
         CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
+        *_carry(grasp, config),
+    )
+    return MotionPlan("grasp", q_start, steps)
+
+
+def plan_carry(grasp: Grasp, q_start: Array, config: CellConfig) -> MotionPlan:
+    """The last part of a grasp's motion, from `q_start` (6,) [rad] where what it took is held high enough already.
+
+    Raises:
+        UnsafeMotion: a pose is out of reach.
+    """
+    return MotionPlan("carry", q_start, _carry(grasp, config))
+
+
+def carry_height(config: CellConfig) -> float:
+    """Height of the tcp above the table [m] from which on a load passes over the walls of the bin."""
+    return config.bin.wall_height_m + LOAD_REACH_M + _CARRY_CLEARANCE_M
+
+
+def _carry(grasp: Grasp, config: CellConfig) -> tuple[Step, ...]:
+    use = config.gripper
+    bin_x, bin_y = _release_point(grasp.x, grasp.y, config)
+    bin_z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M
+    q_bin = solve_tool_down("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
+    return (
         joint_move("carry to bin", q_bin, config, load_m=LOAD_REACH_M),
-        CheckHold("held over the bin", use.empty_width_m),
+        CheckHold(HELD_OVER_BIN, use.empty_width_m),
         Grip("release", use.preshape_m, use.force_n),
         home_move(config),
     )
-    return MotionPlan("grasp", q_start, steps)
 
 
 def _release_point(x: float, y: float, config: CellConfig) -> tuple[float, float]:

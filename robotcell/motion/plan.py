@@ -90,6 +90,6 @@ def guarded_move(label: str, T_base_tcp: Array, config: CellConfig) -> LinearMov
     )
 
 
-def home_move(config: CellConfig) -> JointMove:
-    """The motion to the home pose."""
-    return joint_move("home", np.array(config.motion.home_q), config)
+def home_move(config: CellConfig, load_m: float = 0.0) -> JointMove:
+    """The motion to the home pose; see `JointMove`."""
+    return joint_move("home", np.array(config.motion.home_q), config, load_m)
