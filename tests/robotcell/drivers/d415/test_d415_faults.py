@@ -17,6 +17,7 @@ from robotcell.interfaces import Devices
 from sim_twin.d415.renderer import SERIAL
 from sim_twin.wire.d415.server import CAMERA_FAULTS, WRONG_SERIAL
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.robotcell.config.test_calibration_file import values
 from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE, ServedCamera
 
@@ -50,7 +51,7 @@ SOON_S = 10.0
 
 @pytest.fixture(scope="module")
 def served():
-    with ServedCamera("127.0.0.36", overrides=WITHOUT_NOISE) as camera:
+    with ServedCamera(loopback(36), overrides=WITHOUT_NOISE) as camera:
         yield camera
 
 
@@ -137,7 +138,7 @@ def test_what_can_be_lived_with_is(served, fault):
 
 
 def test_a_server_that_dies_is_lost_and_its_successor_is_found():
-    with ServedCamera("127.0.0.37", overrides=WITHOUT_NOISE) as mortal, driver(mortal) as camera:
+    with ServedCamera(loopback(37), overrides=WITHOUT_NOISE) as mortal, driver(mortal) as camera:
         camera.read()
         mortal.process.kill()
         with pytest.raises(ConnectionLost, match="no frame came"):

@@ -20,6 +20,7 @@ from robotcell.errors import ConnectionLost, DeviceFault
 from robotcell.geometry import rg2
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.robotcell.drivers.served_cell import HOST, serve
 from tests.robotcell.drivers.ur5e.served_arm import (
     LOST_S,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from robotcell.drivers.ur5e.arm import UR5e
     from sim_twin.wire.cell import ServedCell
 
-SECOND_HOST, SECOND_PORTS = "127.0.0.44", (15044, 30444)
+SECOND_HOST, SECOND_PORTS = loopback(44), (15044, 30444)
 
 
 @pytest.fixture
