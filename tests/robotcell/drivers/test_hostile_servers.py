@@ -19,7 +19,7 @@ from tests.robotcell.drivers.hostile_server import HostileServer
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-HOST = "127.0.0.37"
+HOST = "127.0.0.38"
 FEW = settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
