@@ -3,7 +3,7 @@ import socket
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_twin.wire.rg2.modbus import ModbusServer, Refusal, RefusedError, answer, split_frames
@@ -194,6 +194,23 @@ def test_a_client_that_never_reads_is_not_listened_to_for_ever():
             await sending
 
     serve(talk, units)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.one_of(st.binary(max_size=40), PDUS.map(frame)), max_size=4).map(b"".join))
+def test_after_any_noise_the_next_client_is_served(noise):
+    async def talk(server):
+        first = await asyncio.open_connection(HOST, server.port)
+        first[1].write(noise)
+        await hang_up(first)
+        while True:
+            second = await asyncio.open_connection(HOST, server.port)
+            response = await ask(second)
+            await hang_up(second)
+            if response == RESPONSE:
+                return
+
+    serve(talk)
 
 
 class Counting(Ten):
