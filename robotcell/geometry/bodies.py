@@ -7,6 +7,7 @@ the UR5e (joint housings 120 to 150 mm, upper arm 110 mm, forearm 90 mm and wris
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,6 +53,12 @@ _BODIES = (
     (6, (0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 0.045),
     (6, (0.0, 0.0, 0.05), (0.0, 0.0, rg2.PALM_M), 0.055),
 )
+# What errors call the bodies.
+BODY_NAMES = (
+    "base", "shoulder", "upper arm", "elbow", "forearm", "first wrist", "second wrist", "third wrist", "gripper"
+)
+# The gripper's body, which `tool_points` has in more detail.
+GRIPPER_GROUP = 8
 # Bodies this many places apart in the chain share a joint housing or a neighbour's, and cannot touch.
 _NEIGHBOURS = 2
 
@@ -106,6 +113,70 @@ def finger_points(T_base_tcp: Array, load_m: float) -> Array:
     z = load_m - np.linspace(0.0, reach, int(reach / FINGER_SPACING_M) + 2)
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], grid) + T_base_tcp[..., None, :3, 3])
+
+
+@dataclass(frozen=True)
+class ToolPoints:
+    """Small spheres that cover the gripper at one opening, and a load in it, in the frame of the tcp.
+
+    Attributes:
+        points: (N, 3) centres, tcp frame [m].
+        radius_m: of all of them.
+        body: (N,) True for the gripper's body, False for cranks, fingers and load.
+    """
+
+    points: Array
+    radius_m: float
+    body: npt.NDArray[np.bool_]
+
+
+# Centres of neighbouring small spheres are at most twice this apart along a face: they then cover it up to 2 mm.
+TOOL_POINT_M = 0.008
+# A load reaches so far from the middle across the closing direction: the longest block is 100 mm.
+_LOAD_HALF_M = 0.050
+
+
+@lru_cache(maxsize=32)
+def tool_points(opening_m: float, load_m: float) -> ToolPoints:
+    """Spheres that cover the gripper's body, and fingers and load at an opening.
+
+    Args:
+        opening_m: between the finger tips, in the range of the gripper.
+        load_m: how far a load reaches below the tcp; 0 without one.
+    """
+    retracted = -rg2.tip_retraction(opening_m)
+    body_z = -rg2.BODY_ABOVE_TIPS_M
+    body = _box_points((-rg2.BODY_M[0], -rg2.BODY_M[1], body_z - 0.112), (rg2.BODY_M[0], rg2.BODY_M[1], body_z))
+    half, breadth = opening_m / 2, rg2.FINGER_BREADTH_M / 2
+    knuckle = retracted - rg2.KNUCKLE_TO_TIP_M
+    fingers = []
+    for side in (-1.0, 1.0):
+        inner, outer = sorted((side * half, side * (half + rg2.FINGER_THICKNESS_M)))
+        fingers.append(_box_points((inner, -breadth, knuckle), (outer, breadth, retracted)))
+        # The cranks, from the pivots behind the palm to the knuckles.
+        start = np.array([side * rg2.PIVOT_OFFSET_M, 0.0, -(rg2.CLOSED_LENGTH_M - rg2.PIVOTS_M)])
+        end = np.array([side * (half + rg2.FINGER_THICKNESS_M / 2), 0.0, knuckle])
+        along = np.linspace(0.0, 1.0, 5)[:, None] * (end - start) + start
+        fingers.extend(along + (0.0, y, 0.0) for y in (-rg2.CRANKS_M[1] / 2, rg2.CRANKS_M[1] / 2))
+    if load_m > 0:
+        fingers.append(_box_points((-half, -_LOAD_HALF_M, retracted), (half, _LOAD_HALF_M, load_m)))
+    points = np.concatenate([body, *fingers])
+    points.flags.writeable = False
+    return ToolPoints(points, TOOL_POINT_M, np.arange(len(points)) < len(body))
+
+
+def _box_points(low: tuple[float, float, float], high: tuple[float, float, float]) -> Array:
+    """Centres (N, 3) on the faces of a box of spheres of `TOOL_POINT_M` that cover it, and stay within it where it is wide."""
+    inset = [min(TOOL_POINT_M / 2, (b - a) / 2) for a, b in zip(low, high, strict=True)]
+    axes = [
+        np.linspace(a + i, b - i, max(1, int(np.ceil((b - a - 2 * i) / (1.6 * TOOL_POINT_M))) + 1) if b - a > 2 * i else 1)
+        for a, b, i in zip(low, high, inset, strict=True)
+    ]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    faces = np.zeros(len(grid), np.bool_)
+    for axis, values in enumerate(axes):
+        faces |= (grid[:, axis] == values[0]) | (grid[:, axis] == values[-1])
+    return np.asarray(grid[faces])
 
 
 def blocks_view(

@@ -17,11 +17,10 @@ from robotcell.jobs.journal_tables import action_row, frame_row, outcome_row
 from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
 from robotcell.jobs.run_folder import make_run_dir, save_frame
 from robotcell.jobs.verdict import SCENE_CHANGED, Outcome, Result, judge
-from robotcell.motion.actions import plan_action
 from robotcell.motion.config_check import check_config
 from robotcell.motion.executor import Ending
-from robotcell.motion.path_check import check_path
 from robotcell.motion.push import Push
+from robotcell.motion.way import plan_way
 from robotcell.perception.goals import find_goal
 
 if TYPE_CHECKING:
@@ -67,8 +66,8 @@ def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, Che
     view = cell.look(policy.workspace)
     task = _task(view, goal, None)
     action = policy.decide(_observe(view, task, (), may_push=True))
-    plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
-    return Decision(1, goal, view, task, action), check_path(plan, cell.config)
+    plan = plan_way(action, view.heightmap, view.clearance, cell.arm.state().q, cell.config)
+    return Decision(1, goal, view, task, action), plan
 
 
 def run_job(
@@ -208,13 +207,13 @@ class _Job:
     def _run(self, decision: Decision) -> tuple[View, Outcome]:
         cell, view = self.cell, decision.view
         try:
-            plan = plan_action(decision.action, view.heightmap, cell.arm.state().q, cell.config)
-            checked = check_path(plan, cell.config)
+            q = cell.arm.state().q
+            checked = plan_way(decision.action, view.heightmap, view.clearance, q, cell.config)
         except UnsafeMotion as error:
             return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan"))
         execution = cell.executor.run(checked)
         if execution.ending is not Ending.DONE:
-            cell.home()
+            cell.home(view.clearance)
         after = self._look()
         return after, judge(decision.action, decision.goal, view, after, execution)
 

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.surroundings import bin_box
 from robotcell.errors import CalibrationError, DeviceFault
 from robotcell.geometry.bodies import blocks_view
 from robotcell.perception.calibrated_camera import CalibratedCamera
+from robotcell.perception.clearance_map import ClearanceMap, build_clearance_map
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 from robotcell.perception.segmentation import Segmentation, segment
 from robotcell.perception.tags import check_tags
@@ -28,12 +30,14 @@ class View:
         camera: that took it, as its calibration has it.
         heightmap: built from both.
         segmentation: of the heightmap.
+        clearance: up to which height something may stand, wherever the camera looks.
     """
 
     frame: RgbdFrame
     camera: CalibratedCamera
     heightmap: Heightmap
     segmentation: Segmentation
+    clearance: ClearanceMap
 
 
 def look(devices: Devices, config: CellConfig, workspace: Workspace | None = None) -> View:
@@ -66,7 +70,8 @@ def look(devices: Devices, config: CellConfig, workspace: Workspace | None = Non
     heightmap = build_heightmap(frame, camera, workspace, config.table.height_m)
     _check_coverage(heightmap, limits.min_coverage)
     _check_table(heightmap, config)
-    return View(frame, camera, heightmap, segment(heightmap))
+    clearance = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),))
+    return View(frame, camera, heightmap, segment(heightmap), clearance)
 
 
 def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:
