@@ -154,28 +154,30 @@ def densified(path: Array) -> Array:
     return np.asarray(path[whole] + (at - whole)[:, None] * (path[whole + 1] - path[whole]))
 
 
-def _gaps(path: Array, tool: Tool, seen: ClearanceMap, margin: float) -> tuple[Array, Array, Callable[[int, int], Array]]:
+def _gaps(
+    path: Array, tool: Tool, seen: ClearanceMap, margin: float
+) -> tuple[Array, Array, Callable[[int, int], Array]]:
     """Gaps (N, P) [m] of all spheres, what each of them needs (P,), and where sphere p stands at sample n."""
-    frames = ur5e.link_frames(path)
     sphere = bodies.SPHERES
-    link = frames[:, sphere.link[_ARM]]
-    arm = np.einsum("npij,pj->npi", link[..., :3, :3], sphere.center[_ARM]) + link[..., :3, 3]
+    arm = bodies.sphere_centers(path)[:, _ARM]
     radius = np.broadcast_to(sphere.radius[_ARM], arm.shape[:2])
     arm_gaps = seen.gaps(arm.reshape(-1, 3), radius.ravel(), 0.0, margin).reshape(arm.shape[:2])
 
     shape = bodies.tool_points(tool.opening_m, tool.load_m)
-    T_tcp = frames[:, 6] @ rg2.T_FLANGE_TCP
+    T_tcp = ur5e.forward(path) @ rg2.T_FLANGE_TCP
+    tool_gaps = np.full((len(path), len(shape.points)), margin)
+    # The lowest point of the tool bounds which samples can come near anything at all.
     z = T_tcp[:, 2, :3] @ shape.points.T + T_tcp[:, 2, 3:]
-    tool_gaps = np.full(z.shape, margin)
-    low = z - shape.radius_m - margin < seen.top_m + seen.table_height_m
-    groups = [(np.ones(len(shape.points), np.bool_), 0.0)]
-    if tool.touch_m is not None:
-        groups = [(shape.body, 0.0), (~shape.body, tool.touch_m)]
-    for members, above in groups:
-        n, p = np.nonzero(low & members)
-        if n.size:
-            at = np.einsum("kij,kj->ki", T_tcp[n, :3, :3], shape.points[p]) + T_tcp[n, :3, 3]
-            tool_gaps[n, p] = seen.gaps(at, np.full(len(n), shape.radius_m), above, margin)
+    near = np.flatnonzero(z.min(axis=1) - shape.radius_m - margin < seen.top_m + seen.table_height_m)
+    if near.size:
+        at = shape.points @ np.swapaxes(T_tcp[near, :3, :3], 1, 2) + T_tcp[near, None, :3, 3]
+        groups = [(np.ones(len(shape.points), np.bool_), 0.0)]
+        if tool.touch_m is not None:
+            groups = [(shape.body, 0.0), (~shape.body, tool.touch_m)]
+        for members, above in groups:
+            points = at[:, members]
+            gaps = seen.gaps(points.reshape(-1, 3), np.full(points[..., 0].size, shape.radius_m), above, margin)
+            tool_gaps[np.ix_(near, members)] = gaps.reshape(points.shape[:2])
     needed_tool = np.full(len(shape.points), margin)
     if tool.touch_m is not None:
         needed_tool = np.where(shape.body, -_BODY_ERROR_M, 0.0)

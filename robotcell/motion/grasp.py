@@ -113,7 +113,8 @@ def plan_grasp(
     steps: tuple[Step, ...] = (
         Grip("pre-shape", use.preshape_m, use.force_n),
         joint_move("approach", q_above, config),
-        linear_move("descend", T_near, config),
+        # It ends above all that is under the fingers; what they pass beside is the business of who decided.
+        linear_move("descend", T_near, config, touch_m=touch_m),
         guarded_move("descend guarded", T_grasp, config, touch_m),
         Grip("close", rg2.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
         linear_move("lift", T_lifted, config, load_m, touch_m),

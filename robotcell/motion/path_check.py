@@ -314,7 +314,6 @@ def _violations(
         fingers = bodies.box_distance(*box.corners(), points) < limits.clearance_m
         words = f"the arm, the gripper or its load would enter the keep-out {box.name!r}"
         yield body.any(axis=1) | fingers.any(axis=1), lambda _, words=words: words  # type: ignore[misc]
-    yield (
-        bodies.self_distance(centers) < limits.clearance_m,
-        lambda _: "the arm or the gripper would touch the arm itself",
-    )
+    touching = bodies.self_distance(centers) < limits.clearance_m
+    touching |= bodies.hand_distance(centers, T_tcp, load_m) < limits.clearance_m
+    yield touching, lambda _: "the arm, the gripper or its load would touch the arm itself"

@@ -123,7 +123,7 @@ def plan_push(
     steps: tuple[Step, ...] = (
         Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
         joint_move("approach", q_above, config),
-        linear_move("descend", T_near, config),
+        linear_move("descend", T_near, config, touch_m=touch_m),
         guarded_move("descend guarded", T_start, config, touch_m),
         guarded_move("push", T_end, config, touch_m),
         linear_move("lift", T_up, config, touch_m=touch_m),

@@ -48,7 +48,9 @@ _NEAREST_TO_END = 24
 # Where a motion is looked at before all of it is checked.
 _GLANCES = np.array([[0.5], [0.25], [0.75]])
 # Edges that are checked before the search is given up: with about 1 ms each, the longest search takes a tenth of a second.
-_MOST_CHECKS = 80
+_MOST_CHECKS = 60
+# Plans that are led around what is in the way before an action is given up.
+_MOST_SEARCHES = 4
 
 
 def plan_way(
@@ -72,6 +74,7 @@ def plan_way(
         return check_path(plan, config, seen)
     except Obstructed as error:
         usual = error
+    searches = 0
     for q_above in tool_down_solutions(above(action, config), config):
         plans = []
         for q_high in (q_above, *_poses_above(q_above, config)):
@@ -82,12 +85,20 @@ def plan_way(
                 # From higher up the arm comes down to the same pose.
                 break
             plans.append(plan)
-        for lead in (_as_it_is, led_around):
-            for plan in plans:
-                try:
-                    return check_path(lead(plan, seen, config), config, seen)
-                except UnsafeMotion:
-                    continue
+        for plan in plans:
+            try:
+                return check_path(plan, config, seen)
+            except UnsafeMotion:
+                continue
+        # From the lowest place and from the highest: what lies between seldom makes a difference.
+        for plan in plans[:: max(1, len(plans) - 1)]:
+            if searches == _MOST_SEARCHES:
+                break
+            searches += 1
+            try:
+                return check_path(led_around(plan, seen, config), config, seen)
+            except UnsafeMotion:
+                continue
     raise Obstructed(f"{usual}, and no way leads over or around it", usual.obstruction, usual.q)
 
 
@@ -123,10 +134,6 @@ def check_straight(plan: MotionPlan, seen: ClearanceMap, config: CellConfig) -> 
     return starts
 
 
-def _as_it_is(plan: MotionPlan, _seen: ClearanceMap, _config: CellConfig) -> MotionPlan:
-    return plan
-
-
 def _joint_way(
     q: Array, step: JointMove, tool: Tool, seen: ClearanceMap, config: CellConfig, name: str
 ) -> list[JointMove]:
@@ -154,6 +161,8 @@ def _joint_way(
         way = float(np.abs(end - start).max())
         return way / step.speed_rad_s + step.speed_rad_s / step.acceleration_rad_s2
 
+    if not standing_clear(step.q[None], tool, seen, config).all():
+        raise blocked
     poses = _roadmap(config.motion.home_q, config.table.height_m)
     # No way leads through a pose in which the arm may not stand.
     poses = poses[allowed_poses(poses, step.load_m, obstacles(config), config, lowest)]

@@ -99,12 +99,13 @@ class ClearanceMap:
         first = int(np.searchsorted(self._levels, above_m, side="right"))
         if first == len(self._levels):
             return gaps
-        beside = self._distances[first, row, col] < radius[near] + far_m
-        near, row, col = near[beside], row[beside], col[beside]
+        cell = row * cols + col
+        beside = self._distances[cell, first] < radius[near] + far_m
+        near, cell = near[beside], cell[beside]
         if near.size:
-            across = self._distances[first:, row, col]
-            up = np.maximum(0.0, height[near] - self._levels[first:, None])
-            gaps[near] = np.minimum(far_m, np.hypot(across, up).min(axis=0) - radius[near])
+            across = self._distances[cell, first:]
+            up = np.maximum(0.0, height[near, None] - self._levels[first:])
+            gaps[near] = np.minimum(far_m, np.sqrt((across * across + up * up).min(axis=1)) - radius[near])
         return gaps
 
     @cached_property
@@ -161,7 +162,7 @@ class ClearanceMap:
 
     @cached_property
     def _distances(self) -> npt.NDArray[np.float32]:
-        """(K, H, W) horizontal distance [m] from each cell to the nearest one that belongs to this class or a higher one.
+        """(H * W, K) horizontal distance [m] from each cell to the nearest one of this class of height or a higher one.
 
         It is of the cells' nearest corners, so that no place of either cell is nearer.
         """
@@ -173,7 +174,8 @@ class ClearanceMap:
                 distances[level] = np.inf
             else:
                 distances[level] = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        return np.asarray(np.maximum(0.0, (distances - np.float32(np.sqrt(2))) * np.float32(RESOLUTION_M)))
+        nearest = np.maximum(0.0, (distances - np.float32(np.sqrt(2))) * np.float32(RESOLUTION_M))
+        return np.ascontiguousarray(nearest.reshape(len(below), -1).T)
 
 
 def build_clearance_map(
