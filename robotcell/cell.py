@@ -131,8 +131,8 @@ class Cell:
         """Straight up, open the fingers, and to the home pose, supervised.
 
         Args:
-            seen: what may stand on the table, by the last look (`View.clearance`). Without it the arm goes up as high as
-                it can first, and does not know what stands in its way.
+            seen: what may stand on the table, by the last look (`View.clearance`). Without it the arm goes up as high
+                as it can first, and does not know what stands in its way.
 
         Raises:
             UnsafeMotion: the way is not safe; nothing moved.

@@ -168,7 +168,7 @@ class ToolPoints:
     body: npt.NDArray[np.bool_]
 
 
-# Centres of neighbouring small spheres are at most twice this apart along a face: they then cover it up to 2 mm.
+# Radius of the small spheres. Their centres are at most 1.6 radii apart: they then cover a face up to 2 mm.
 TOOL_POINT_M = 0.008
 # A load reaches so far from the middle across the closing direction: the longest block is 100 mm.
 _LOAD_HALF_M = 0.050
@@ -195,7 +195,7 @@ def tool_points(opening_m: float, load_m: float) -> ToolPoints:
         start = np.array([side * rg2.PIVOT_OFFSET_M, 0.0, -(rg2.CLOSED_LENGTH_M - rg2.PIVOTS_M)])
         end = np.array([side * (half + rg2.FINGER_THICKNESS_M / 2), 0.0, knuckle])
         along = np.linspace(0.0, 1.0, 5)[:, None] * (end - start) + start
-        fingers.extend(along + (0.0, y, 0.0) for y in (-rg2.CRANKS_M[1] / 2, rg2.CRANKS_M[1] / 2))
+        fingers.extend(along + np.array([0.0, y, 0.0]) for y in (-rg2.CRANKS_M[1] / 2, rg2.CRANKS_M[1] / 2))
     if load_m > 0:
         fingers.append(_box_points((-half, -_LOAD_HALF_M, retracted), (half, _LOAD_HALF_M, load_m)))
     points = np.concatenate([body, *fingers])
@@ -204,14 +204,12 @@ def tool_points(opening_m: float, load_m: float) -> ToolPoints:
 
 
 def _box_points(low: tuple[float, float, float], high: tuple[float, float, float]) -> Array:
-    """Centres (N, 3) on the faces of a box of spheres of `TOOL_POINT_M` that cover it, and stay within it where it is wide."""
-    inset = [min(TOOL_POINT_M / 2, (b - a) / 2) for a, b in zip(low, high, strict=True)]
-    axes = [
-        np.linspace(
-            a + i, b - i, max(1, int(np.ceil((b - a - 2 * i) / (1.6 * TOOL_POINT_M))) + 1) if b - a > 2 * i else 1
-        )
-        for a, b, i in zip(low, high, inset, strict=True)
-    ]
+    """Centres (N, 3) on the faces of a box, of spheres of `TOOL_POINT_M` that cover it."""
+    axes = []
+    for a, b in zip(low, high, strict=True):
+        inset = min(TOOL_POINT_M / 2, (b - a) / 2)
+        count = int(np.ceil((b - a - 2 * inset) / (1.6 * TOOL_POINT_M))) + 1
+        axes.append(np.linspace(a + inset, b - inset, count))
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     faces = np.zeros(len(grid), np.bool_)
     for axis, values in enumerate(axes):

@@ -55,19 +55,22 @@ class Report:
     cell_s: float
 
 
-def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, CheckedPlan]:
-    """Look, decide, plan and check one action; nothing moves.
+def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, CheckedPlan | UnsafeMotion]:
+    """Look, decide, plan and check one action; nothing moves. A plan that is refused comes as the refusal.
 
     Raises:
-        ConfigError, NoTarget, UnsafeMotion: as in a job.
+        ConfigError, NoTarget: as in a job.
         ConnectionLost, DeviceFault, CalibrationError: as `Cell.look`.
     """
     check_config(cell.config)
     view = cell.look(policy.workspace)
     task = _task(view, goal, None)
     action = policy.decide(_observe(view, task, (), may_push=True))
-    plan = plan_way(action, view.heightmap, view.clearance, cell.arm.state().q, cell.config)
-    return Decision(1, goal, view, task, action), plan
+    decision = Decision(1, goal, view, task, action)
+    try:
+        return decision, plan_way(action, view.heightmap, view.clearance, cell.arm.state().q, cell.config)
+    except UnsafeMotion as refusal:
+        return decision, refusal
 
 
 def run_job(

@@ -31,7 +31,7 @@ _JOINT_STEP_RAD = 0.020
 # Beyond this a clearance is not told apart.
 FAR_M = 0.080
 # Links that stand on the table are no part of the check.
-_ARM = np.flatnonzero((bodies.SPHERES.group >= 2) & (bodies.SPHERES.group != bodies.GRIPPER_GROUP))  # noqa: PLR2004
+_ARM = np.flatnonzero((bodies.SPHERES.group >= 2) & (bodies.SPHERES.group != bodies.GRIPPER_GROUP))
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def standing_clear(poses: Array, tool: Tool, seen: ClearanceMap, config: CellCon
 
 
 def smallest_gaps(path: Array, tool: Tool, seen: ClearanceMap) -> Array:
-    """The clearance (N,) [m] at each sample of a path (N, 6), by what does not lie where contact is meant; at most `FAR_M`."""
+    """The clearance (N,) [m], at most `FAR_M`, at each sample of a path (N, 6); without what may touch there."""
     gaps, needed, _ = _gaps(path, tool, seen, FAR_M)
     return np.asarray(np.where(needed > 0, gaps, FAR_M).min(axis=1))
 

@@ -61,7 +61,8 @@ def check_path(
 
     Reach, joint limits, singularities on straight lines, speeds, the box of the tcp, keep-outs, the table, the arm
     itself and the gripper's range; with the load where one is held; and what the camera saw. Where the arm stands at
-    the start is a fact, not a plan: only where it goes is checked, so that it can leave a place that it should not be in.
+    the start is a fact, not a plan: only where it goes is checked, so that it can leave a place that it should not be
+    in.
 
     Args:
         plan: to be checked.
@@ -283,7 +284,7 @@ def _violations(
         angle = path[np.abs(path[:, joint]).argmax(), joint]
         return f"joint {joint + 1} would turn to {angle:.2f} rad (limit +-{margin[joint]:.2f} rad)"
 
-    yield (np.abs(path) > margin).any(axis=1), beyond
+    yield np.asarray((np.abs(path) > margin).any(axis=1)), beyond
     T_tcp = ur5e.forward(path) @ rg2.T_FLANGE_TCP
     tcp = T_tcp[:, :3, 3]
 
@@ -291,7 +292,7 @@ def _violations(
         z = tcp[:, 2].min() - table
         return f"the finger tips would be {1000 * z:.1f} mm above the table (limit {1000 * lowest_tip_m:.1f} mm)"
 
-    yield tcp[:, 2] < table + lowest_tip_m - _ROUNDING_M, too_low
+    yield np.asarray(tcp[:, 2] < table + lowest_tip_m - _ROUNDING_M), too_low
 
     def left_box(i: int) -> str:
         x, y, z = tcp[i]
@@ -305,7 +306,7 @@ def _violations(
     radius = bodies.SPHERES.radius + limits.clearance_m
     above = bodies.SPHERES.group >= _STANDS_ON_TABLE
     yield (
-        (centers[:, above, 2] - radius[above] < table).any(axis=1),
+        np.asarray((centers[:, above, 2] - radius[above] < table).any(axis=1)),
         lambda _: "the arm or the gripper's body would touch the table",
     )
     points = bodies.finger_points(T_tcp, load_m)

@@ -1,16 +1,17 @@
 """A way for an action: the plan that keeps clear of what the camera saw, over or around it where it must.
 
-The usual plan is tried first. If something stands in its way, the tool comes down from higher up and is lifted higher.
-If that is not enough, the joint motions are led over or around what is in the way by a search on a roadmap of poses with
-the tool down. Then the other solutions of the arm for the pose above the action are tried (the symmetric jaw turned by
-half a turn, the wrist or the elbow turned over), those nearest to the home pose first. The search is deterministic: the
-same view gives the same plan.
+The usual plan is tried first. If something stands in its way, the tool comes down from higher up and is lifted
+higher. If that is not enough, the joint motions are led over or around what is in the way by a search on a roadmap of
+poses with the tool down. Then the other solutions of the arm for the pose above the action are tried (the symmetric
+jaw turned by half a turn, the wrist or the elbow turned over), those nearest to the home pose first. The search is
+deterministic: the same view gives the same plan.
 """
 
 from __future__ import annotations
 
 import heapq
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,7 +48,7 @@ _NEIGHBOURS = 10
 _NEAREST_TO_END = 24
 # Where a motion is looked at before all of it is checked.
 _GLANCES = np.array([[0.5], [0.25], [0.75]])
-# Edges that are checked before the search is given up: with about 1 ms each, the longest search takes a tenth of a second.
+# Edges that are checked before a search is given up.
 _MOST_CHECKS = 60
 # Plans that are led around what is in the way before an action is given up.
 _MOST_SEARCHES = 4
@@ -75,7 +76,10 @@ def plan_way(
     except Obstructed as error:
         usual = error
     searches = 0
-    for q_above in tool_down_solutions(above(action, config), config):
+    home, tool = plan.steps[-1], tools(plan)[-1]
+    # Every plan ends in the home pose: where the arm may not stand there, none is looked for.
+    at_home = isinstance(home, JointMove) and bool(standing_clear(home.q[None], tool, seen, config).all())
+    for q_above in tool_down_solutions(above(action, config), config) if at_home else ():
         plans = []
         for q_high in (q_above, *_poses_above(q_above, config)):
             try:
@@ -224,7 +228,7 @@ def _shortest_way(
         way = _dijkstra(edges, 0, last)
         if way is None:
             return None
-        for i, j in zip(way, way[1:]):
+        for i, j in pairwise(way):
             if (i, j) in known_free:
                 continue
             checks += 1
@@ -284,7 +288,7 @@ def _roadmap(home_q: tuple[float, ...], table_height_m: float) -> Array:
     radius = float(np.hypot(*T_home[:2, 3]))
     poses = []
     for turn in np.arange(-np.pi, np.pi - 1e-9, _AZIMUTH_RAD):
-        start = home + (turn, 0.0, 0.0, 0.0, 0.0, 0.0)
+        start = home + np.array([turn, 0.0, 0.0, 0.0, 0.0, 0.0])
         for r in _RADII_M:
             for z in _HEIGHTS_M:
                 T = make_transform(rotation_z(turn), (0.0, 0.0, 0.0)) @ T_home

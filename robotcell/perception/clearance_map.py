@@ -120,7 +120,7 @@ class ClearanceMap:
         return 0 <= row < rows and 0 <= col < cols and bool(self.looked_at[row, col])
 
     def tallest_near(self, x: float, y: float, reach_m: float, above_m: float) -> tuple[float, float, float, bool]:
-        """The highest cell within a square around a place: its x, y, height above the table [m], and whether it ends there.
+        """The top of what stands nearest to a place: its x, y, its height above the table [m], and if it is open.
 
         Args:
             x: of the place, base frame [m].
@@ -205,8 +205,8 @@ def build_clearance_map(
     X, Y = (grid.ravel() for grid in np.meshgrid(x, y))
     foot = np.full(rows * cols, _LOWEST_M)
     for box in furniture:
-        standing = (X > box.x[0] - _FURNITURE_M) & (X < box.x[1] + _FURNITURE_M)
-        standing &= (Y > box.y[0] - _FURNITURE_M) & (Y < box.y[1] + _FURNITURE_M)
+        standing = np.abs(X - sum(box.x) / 2) < (box.x[1] - box.x[0]) / 2 + _FURNITURE_M
+        standing &= np.abs(Y - sum(box.y) / 2) < (box.y[1] - box.y[0]) / 2 + _FURNITURE_M
         foot[standing] = np.maximum(foot[standing], box.z[1] - table_height_m + _LOWEST_M)
 
     def look(cells: npt.NDArray[np.intp], height: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:

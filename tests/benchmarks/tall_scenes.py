@@ -1,13 +1,15 @@
-"""Picks blocks among bottles, posts and boxes of 0.1 to 0.6 m: `python -m tests.benchmarks.tall_scenes --scenes 200 --seed 0`.
+"""Picks blocks among bottles, posts and boxes of 0.1 to 0.6 m.
+
+Run `python -m tests.benchmarks.tall_scenes --scenes 200 --seed 0`.
 
 What counts happens in the world, not in the robot's belief: in every physics step the engine says which link of arm or
 gripper touches which object. Contact is meant while the arm moves at the guarded speed, while it stands and its fingers
-move, and while it is lifted straight up from there; then fingers may touch. With what they hold they may stay in contact.
-Every other contact is a violation.
+move, and while it is lifted straight up from there; then fingers may touch, and the gripper's body what they touch.
+With what they hold they may stay in contact. Every other contact is a violation.
 
-A goal has a way if one of the sixteen directions of a grasp in its middle has a plan by the true shapes of all objects (not
-by what the camera sees), the fingers coming down beside it on nothing, and the goal fitting between them. Pushes, which
-could make a way, are not counted.
+A goal has a way if one of the eight directions of a grasp in its middle has a plan by the true shapes of all objects
+(not by what the camera sees), the fingers coming down beside it on nothing, and the goal fitting between them. Pushes,
+which could make a way, are not counted.
 
 Rows go to a file, one per goal; a run that was ended goes on where it stopped.
 """
@@ -28,7 +30,7 @@ from policy import make_policy
 from robotcell.cell import Cell
 from robotcell.config import load_config
 from robotcell.errors import CellError, UnsafeMotion
-from robotcell.geometry import bodies, rg2, ur5e
+from robotcell.geometry import bodies
 from robotcell.geometry.transforms import make_transform, rotation_z, transform_points
 from robotcell.interfaces import Devices
 from robotcell.jobs.job import run_job
@@ -115,7 +117,7 @@ class WatchedArm:
     def __init__(self, arm: Any, config: CellConfig) -> None:
         self._arm = arm
         self._guarded_m_s = config.motion.guarded_speed_m_s
-        # Whether contact of the fingers is meant now: in a guarded motion, after one, and in the way straight up from there.
+        # Whether contact of the fingers is meant now: in a guarded motion, after it, and straight up from there.
         self.contact_is_meant = False
         self.leaves = False
         self.label = "stands"
@@ -202,6 +204,7 @@ def has_way(objects: list[tuple[SceneObject, Array]], goal: str, config: CellCon
     opening = config.gripper.preshape_m
     shape = bodies.tool_points(opening, 0.0)
     fingers = shape.points[~shape.body]
+    flat, home = heightmap(np.full(config.workspace.shape, top, np.float32)), np.array(config.motion.home_q)
     for rotation in range(GRASP_ROTATIONS):
         grasp = Grasp(float(x), float(y), top, rotation, 1.0)
         along = points[:, :2] @ (np.cos(grasp.theta), np.sin(grasp.theta))
@@ -212,13 +215,7 @@ def has_way(objects: list[tuple[SceneObject, Array]], goal: str, config: CellCon
         if others.gaps(around, np.full(len(around), shape.radius_m - 0.004), 0.0, 0.01).min() < 0:
             continue
         try:
-            plan_way(
-                grasp,
-                heightmap(np.full(config.workspace.shape, top, np.float32)),
-                everything,
-                np.array(config.motion.home_q),
-                config,
-            )
+            plan_way(grasp, flat, everything, home, config)
         except UnsafeMotion:
             continue
         return True
@@ -276,7 +273,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
     share = picked / len(ways) if ways else 1.0
     return (
         f"{len(scenes)} scenes: {len(touched)} with a contact outside the guarded parts, {len(stopped)} stopped; "
-        f"{picked} of {len(ways)} goals with a way picked ({share:.0%}), {sum(r['picked'] for r in rows)} of {len(rows)} in all"
+        f"{picked} of {len(ways)} goals with a way picked ({share:.0%}), "
+        f"{sum(row['picked'] for row in rows)} of {len(rows)} in all"
     )
 
 
