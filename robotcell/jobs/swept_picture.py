@@ -1,4 +1,4 @@
-"""The picture of a plan from above: what arm, gripper and load sweep in each motion, and how near they come to things."""
+"""The page of a plan from above: what arm, gripper and load sweep, and how near they come to things."""
 
 from __future__ import annotations
 
