@@ -15,8 +15,8 @@ from calibration.target.held_board import HOLDERS, HeldBoard
 from cli.calibrate_board import BoardOptions, make_board
 from cli.calibrate_solve import print_solution
 from cli.console import progress, report_error, results
-from robotcell.cell import open_cell
 from robotcell.errors import CalibrationError, CellError, ConfigError
+from robotcell.jobs.opening import open_cell
 
 if TYPE_CHECKING:
     from pathlib import Path

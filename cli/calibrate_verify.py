@@ -11,8 +11,8 @@ from rich.text import Text
 
 from calibration.verify import HOVER_M, Verification, verify
 from cli.console import print_json, progress, report_error, results
-from robotcell.cell import open_cell
 from robotcell.errors import CalibrationError, CellError
+from robotcell.jobs.opening import open_cell
 from robotcell.motion.config_check import check_config
 
 if TYPE_CHECKING:

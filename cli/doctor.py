@@ -1,15 +1,13 @@
-"""`robotcell doctor` and `robotcell recover`: what is wrong with a cell, and leaving a stop."""
+"""`robotcell doctor`: what is wrong with a cell."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import typer
 from rich.table import Table
 from rich.text import Text
 
 from cli.console import print_json, progress, report_error, results
-from robotcell.cell import open_cell
 from robotcell.drivers.doctor.examine import examine
 from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import CellError
@@ -36,26 +34,6 @@ def run_doctor(choice: CellChoice, seconds: float, *, as_json: bool) -> int:
     else:
         _print(findings)
     return _SOMETHING_WRONG if wrong else 0
-
-
-def run_recover(choice: CellChoice, *, yes: bool) -> int:
-    """Leave a stop after the operator has looked at the cell; returns the exit code."""
-    try:
-        config = choice.load()
-        cell = open_cell(config)
-        question = (
-            "Nothing touches the arm, nobody is within its reach, and what it holds may fall or stay: leave the stop?"
-        )
-        if not yes and not typer.confirm(question, err=True):
-            progress().print("nothing was changed")
-            return _SOMETHING_WRONG
-        with progress().status("leaving the stop"), cell.arm as arm:
-            cell.recover()
-            mode = arm.state().mode.value
-    except CellError as error:
-        return report_error(error)
-    results().print(Text(f"the arm is {mode}"))
-    return 0
 
 
 def _print(findings: list[Finding]) -> None:

@@ -12,6 +12,7 @@ from rich.text import Text
 from cli.console import report_error, results
 from robotcell.errors import CellError
 from robotcell.jobs.journal import Journal, Metrics
+from robotcell.jobs.ownership import life
 
 if TYPE_CHECKING:
     from cli.options import CellChoice
@@ -40,7 +41,7 @@ def list_jobs(cell: CellChoice, limit: int) -> int:
             f"{job.started:%Y-%m-%d %H:%M:%S}",
             _goal(job),
             Text(job.policy),
-            job.status,
+            _status(job),
             str(metrics.grasp_successes),
             str(metrics.actions),
             _percent(metrics.grasp_success_rate),
@@ -58,13 +59,20 @@ def show_job(cell: CellChoice, job_id: int) -> int:
     except CellError as error:
         return report_error(error)
     out = results()
-    out.print(Text(f"job {job.id}: pick {_goal(job)} with {job.policy}, {job.status}", style="bold"), soft_wrap=True)
+    heading = f"job {job.id}: pick {_goal(job)} with {job.policy}, {_status(job)}"
+    out.print(Text(heading, style="bold"), soft_wrap=True)
     if job.reason:
         out.print(Text(job.reason), soft_wrap=True)
     out.print(_actions(job))
     out.print(_figures(metrics))
     out.print(Text(f"pictures: {job.run_dir}"), soft_wrap=True)
     return 0
+
+
+def _status(job: Job) -> str:
+    """How a job stands; one whose process has ended without a word is interrupted."""
+    alive = life(job)
+    return job.status if alive is None else alive.value
 
 
 def _actions(job: Job) -> Table:

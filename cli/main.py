@@ -1,15 +1,14 @@
 """The `robotcell` command.
 
 Exit codes: 0 complete, 1 not complete, 2 wrong usage or configuration, 3 a device or the safety layer stopped the
-cell, 130 interrupted, 143 terminated.
+cell, 129 the terminal was closed, 130 interrupted, 143 terminated.
 """
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
@@ -17,9 +16,7 @@ from cli.calibrate import app as calibrate_app
 from cli.jobs import app as jobs_app
 from cli.options import CellChoice, CellFile, Meshes, Objects, Scene, Seed, Settings, Verbose
 from cli.served_twin import app as twin_app
-
-if TYPE_CHECKING:
-    from types import FrameType
+from cli.signals import end_cleanly_on_signals
 
 # Everything heavy is imported inside the commands, so that --help answers at once.
 
@@ -199,29 +196,60 @@ def doctor(
 
 
 @app.command()
+def resume(
+    job: Annotated[
+        int | None, typer.Argument(help="The job's number; the last one of the cell unless given.", show_default=False)
+    ] = None,
+    cell: CellFile = None,
+    settings: Settings = None,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON summary and nothing else.")] = False,
+    verbose: Verbose = False,
+) -> None:
+    """Go on with a job that was killed, interrupted or stopped, from where the arm stands.
+
+    Exit codes: as of pick.
+    """
+    from cli.pick import run_resume
+
+    raise typer.Exit(run_resume(job, CellChoice(cell, settings), as_json=json_))
+
+
+@app.command()
+def stop(
+    cell: CellFile = None,
+    settings: Settings = None,
+    verbose: Verbose = False,
+) -> None:
+    """Stop the command that has the cell open, from another terminal. This is no emergency stop.
+
+    Exit codes: 0 it has ended and the arm stands, or there was none, 2 usage or configuration, 3 it did not end.
+    """
+    from cli.operator import run_stop
+
+    raise typer.Exit(run_stop(CellChoice(cell, settings)))
+
+
+@app.command()
 def recover(
     cell: CellFile = None,
     settings: Settings = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask: the cell was looked at.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask; only where no terminal is. The cell was looked at.")
+    ] = False,
     verbose: Verbose = False,
 ) -> None:
-    """Leave a protective stop, or make an arm ready whose program was stopped. Asks first.
+    """After a stop: show what happened, ask, leave the stops of the devices, and take the arm home slowly.
 
-    Exit codes: 0 the arm is ready, 2 usage or configuration, 3 it is not.
+    Exit codes: 0 the arm is ready and no stop stands, 2 usage or configuration, 3 it is not, or the answer was no.
     """
-    from cli.doctor import run_recover
+    from cli.operator import run_recover
 
     raise typer.Exit(run_recover(CellChoice(cell, settings), yes=yes))
 
 
-def _end(number: int, _frame: FrameType | None) -> NoReturn:
-    sys.exit(128 + number)
-
-
 def main() -> None:
     """Entry point of the console script."""
-    # As an interrupt does: the arm is stopped and the journal closed before the process ends.
-    signal.signal(signal.SIGTERM, _end)
+    end_cleanly_on_signals()
     try:
         app()
     except KeyboardInterrupt:

@@ -10,12 +10,14 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import error_as_json, print_json, progress, report_error, results
+from cli.keyboard import KeyboardHold
 from policy import make_policy
-from robotcell.cell import open_cell
+from robotcell.config import find_backend
 from robotcell.errors import CellError, ConfigError, NoTarget, UnsafeMotion
 from robotcell.io.images import write_image
-from robotcell.jobs.job import Report, preview, run_job
+from robotcell.jobs.job import Report, preview, resume_job, run_job
 from robotcell.jobs.journal import Journal
+from robotcell.jobs.opening import open_cell
 from robotcell.jobs.pictures import JobPictures, describe, draw_preview
 from robotcell.jobs.run_folder import make_run_dir
 from robotcell.motion.config_check import check_config
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from cli.options import CellChoice
     from robotcell.config import CellConfig
     from robotcell.jobs.decision import Decision
+    from robotcell.jobs.journal_tables import Job
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
     from robotcell.perception.view import View
@@ -53,9 +56,40 @@ def run_pick(
         check_config(config)
         if dry_run:
             return _dry_run(goals, config, as_json=as_json)
-        report, error = _run(goals, config, progress())
+        report, error = _run(goals, None, config)
     except CellError as refusal:
         error = refusal
+    return _conclude(report, error, started, as_json=as_json)
+
+
+def run_resume(job_id: int | None, cell: CellChoice, *, as_json: bool) -> int:
+    """Go on with a job, the last one of the cell unless `job_id` says which; returns the exit code."""
+    started = time.perf_counter()
+    report, error = None, None
+    try:
+        config = cell.load()
+        check_config(config)
+        with Journal(config.journal.database_url()) as journal:
+            job = _last_job(journal, config) if job_id is None else journal.job(job_id)
+        config = config.model_copy(update={"policy": config.policy.model_copy(update={"name": job.policy})})
+        report, error = _run(None, job.id, config)
+    except CellError as refusal:
+        error = refusal
+    return _conclude(report, error, started, as_json=as_json)
+
+
+def _last_job(journal: Journal, config: CellConfig) -> Job:
+    name = find_backend(config.backend.name).cell_name(config)
+    if name is None:
+        raise ConfigError("a twin without servers ends with its process, and so do its jobs: start a new one")
+    job = journal.newest_job(name)
+    if job is None:
+        raise ConfigError("the journal has no job of this cell: start one with robotcell pick")
+    return job
+
+
+def _conclude(report: Report | None, error: CellError | None, started: float, *, as_json: bool) -> int:
+    """Print what came of a job; returns the exit code."""
     if error is None and report is not None and not report.completed:
         # What is asked for is not there, or was given up.
         error = NoTarget(report.reason)
@@ -79,8 +113,14 @@ def _goals(goal: str | None, everything: bool) -> tuple[str, ...] | None:
     return words
 
 
-def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tuple[Report | None, CellError | None]:
-    """Run a job to its end; the report, and the error that stopped it. Whatever started leaves its pictures."""
+def _run(
+    goals: tuple[str, ...] | None, resumed: int | None, config: CellConfig
+) -> tuple[Report | None, CellError | None]:
+    """Run a job to its end, a new one or one that is resumed; the report, and the error that stopped it.
+
+    Whatever started leaves its pictures.
+    """
+    err = progress()
     with ExitStack() as stack:
         policy = make_policy(config.policy.name, config)
         journal = stack.enter_context(Journal(config.journal.database_url()))
@@ -89,7 +129,11 @@ def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tup
         pictures, following = JobPictures(config), _Progress(err, status)
         error = None
         try:
-            report = run_job(cell, policy, journal, goals, (pictures, following))
+            hold = stack.enter_context(KeyboardHold(following.tell))
+            if resumed is None:
+                report = run_job(cell, policy, journal, goals, (pictures, following), hold)
+            else:
+                report = resume_job(cell, policy, journal, resumed, (pictures, following), hold)
         except CellError as stop:
             if following.job is None:
                 raise
@@ -157,6 +201,10 @@ class _Progress:
         self.job = job_id, run_dir
         self._console.print(Text(f"job {job_id}, {run_dir}"), soft_wrap=True)
         self._status.update("looking")
+
+    def tell(self, words: str) -> None:
+        """Print what the operator did."""
+        self._console.print(words, style="bold")
 
     def looked(self, view: View) -> None:
         """Show what is on the table."""

@@ -19,7 +19,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from robotcell.cell import Cell, open_cell
+    from robotcell.cell import Cell
     from robotcell.config import CellConfig, load_config
     from robotcell.errors import (
         CalibrationError,
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from robotcell.interfaces import Arm, ArmState, Camera, Clock, Devices, Gripper, GripperState, RgbdFrame
     from robotcell.jobs.job import Report, run_job
     from robotcell.jobs.journal import Journal
+    from robotcell.jobs.opening import open_cell
     from robotcell.jobs.policy_api import Action, Observation, PickAny, PickGoal, Policy, Uncover
     from robotcell.motion.executor import Ending, Execution
     from robotcell.motion.grasp import Grasp
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from robotcell.perception.view import View
 
 _PLACES = {
-    "robotcell.cell": ("Cell", "open_cell"),
+    "robotcell.cell": ("Cell",),
     "robotcell.config": ("CellConfig", "load_config"),
     "robotcell.errors": (
         "CalibrationError",
@@ -58,6 +59,7 @@ _PLACES = {
     "robotcell.interfaces": ("Arm", "ArmState", "Camera", "Clock", "Devices", "Gripper", "GripperState", "RgbdFrame"),
     "robotcell.jobs.job": ("Report", "run_job"),
     "robotcell.jobs.journal": ("Journal",),
+    "robotcell.jobs.opening": ("open_cell",),
     "robotcell.jobs.policy_api": ("Action", "Observation", "PickAny", "PickGoal", "Policy", "Uncover"),
     "robotcell.motion.executor": ("Ending", "Execution"),
     "robotcell.motion.grasp": ("Grasp",),

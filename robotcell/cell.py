@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import uuid
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -9,21 +11,24 @@ import numpy as np
 
 from robotcell.config import find_backend
 from robotcell.errors import ConnectionLost, DeviceFault
+from robotcell.io.lock_file import LockFile
 from robotcell.motion.executor import Execution, Executor
 from robotcell.motion.guard import Latch
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
-from robotcell.motion.retreat import check_retreat
+from robotcell.motion.retreat import check_recovery, check_retreat
 from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from types import TracebackType
 
     import numpy.typing as npt
 
     from robotcell.config import CellConfig, Workspace
     from robotcell.interfaces import Arm, Camera, Clock, Devices, Gripper
+    from robotcell.motion.guard import StopStore
+    from robotcell.motion.path_check import CheckedPlan
     from robotcell.motion.plan import Step
     from robotcell.perception.clearance_map import ClearanceMap
 
@@ -36,11 +41,15 @@ class Cell:
         config: of the cell.
         devices: arm, gripper, camera and clock.
         latch: remembers a safety stop until an operator recovers the cell.
+        lock: that this process owns while the cell is open; None where nobody else can open it.
+        lasting: whether the cell is still there when this process has ended; a simulated one is not.
     """
 
     config: CellConfig
     devices: Devices
     latch: Latch = field(default_factory=Latch)
+    lock: LockFile | None = None
+    lasting: bool = False
 
     @property
     def arm(self) -> Arm:
@@ -156,26 +165,70 @@ class Cell:
         plan = MotionPlan(label, self.arm.state().q, tuple(steps))
         return self.executor.run(check_path(plan, self.config, seen))
 
-    def recover(self) -> None:
-        """Leave a stop of gripper and arm, because an operator asked for it. The arm must be connected.
+    def recovery(self) -> CheckedPlan:
+        """The motion that `recover` makes from where the arm stands now.
+
+        Raises:
+            UnsafeMotion: that way is not safe.
+            ConnectionLost: the arm is not connected.
+        """
+        return check_recovery(self.arm.state(), self.config)
+
+    def leave_stops(self) -> None:
+        """Leave a stop of gripper and arm; nothing moves. Only because an operator asked for it. The arm is connected.
 
         Raises:
             ConnectionLost, DeviceFault: a device cannot leave its stop; the message says what to do there.
         """
         self.gripper.recover()
         self.arm.recover()
+        self.gripper.connect()
+
+    def recover(self) -> None:
+        """Leave the stops of the devices, go home slowly, and forget the stop; only because an operator asked for it.
+
+        The arm must be connected. The way starts from measured joints, and the fingers stay as they are. The latch is
+        cleared last: until the arm is home, the stop stands.
+
+        Raises:
+            ConnectionLost, DeviceFault: a device cannot leave its stop; the message says what to do there.
+            UnsafeMotion: the way home is not safe; nothing moved, and the stop stands.
+            GuardTripped: the arm was stopped on its way; the stop stands.
+            StorageError: the arm is home, and the journal cannot be told.
+        """
+        self.leave_stops()
+        plan = self.recovery()
+        if plan.plan.steps:
+            # The latch stands until the arm is home, and bars all others.
+            Executor(self.devices, self.config, Latch()).run(plan)
         self.latch.clear()
 
+    @contextmanager
+    def opened_to_recover(self) -> Iterator[None]:
+        """As a context manager: owns the cell and connects the arm, which is all that `recover` asks for.
+
+        Raises:
+            ConnectionLost, DeviceFault, StorageError: as when the cell is opened.
+        """
+        try:
+            self._own()
+            self.arm.connect()
+            yield
+        finally:
+            self.close()
+
     def __enter__(self) -> Cell:
-        """Connect every device, so that one attempt shows everything that is wrong.
+        """Own the cell, and connect every device, so that one attempt shows everything that is wrong.
 
         Raises:
             ConnectionLost, DeviceFault: the failure of the one device that failed, or all of them together
-                (as DeviceFault if every device could be reached).
+                (as DeviceFault if every device could be reached); or another process has the cell.
+            StorageError: the lock or the latch cannot be read.
             ConfigError: a backend finds its own settings wrong, at the first device.
         """
         failures: list[tuple[str, ConnectionLost | DeviceFault]] = []
         try:
+            self._own()
             for name, device in (("arm", self.arm), ("gripper", self.gripper), ("camera", self.camera)):
                 try:
                     device.connect()
@@ -198,16 +251,42 @@ class Cell:
         self.close()
 
     def close(self) -> None:
-        """Close every device; idempotent."""
-        self.camera.close()
-        self.gripper.close()
-        self.arm.close()
+        """Close every device, the arm first, whatever interrupts it; then let others have the cell. Idempotent."""
+        with ExitStack() as last_to_first:
+            if self.lock is not None:
+                last_to_first.callback(self.lock.release, forget=not self.lasting)
+            for device in (self.camera, self.gripper, self.arm):
+                last_to_first.callback(device.close)
+
+    def _own(self) -> None:
+        """Take the lock, and over the stop that an earlier process left.
+
+        Raises:
+            DeviceFault: another process has the cell.
+            StorageError, ConfigError: the lock or the latch cannot be read.
+        """
+        if self.lock is not None:
+            owner = self.lock.acquire()
+            if owner is not None:
+                raise DeviceFault(
+                    f"the cell ({self.lock.name}) is in use by {owner}: wait until that has ended, or end it by "
+                    "robotcell stop"
+                )
+        self.latch.load()
 
 
-def open_cell(config: CellConfig) -> Cell:
+def open_cell(config: CellConfig, store: StopStore | None = None) -> Cell:
     """The cell of a configuration, its devices not yet connected: use it in a `with` statement.
+
+    Args:
+        config: of the cell.
+        store: keeps a stop for the next process; without one a stop ends with this one. `robotcell.open_cell` gives the
+            journal's.
 
     Raises:
         ConfigError: its backend is not installed.
     """
-    return Cell(config, find_backend(config.backend.name).open(config))
+    backend = find_backend(config.backend.name)
+    name = backend.cell_name(config)
+    lock = LockFile(name or f"process-{uuid.uuid4().hex}")
+    return Cell(config, backend.open(config), Latch(store if name else None), lock, lasting=name is not None)

@@ -15,13 +15,21 @@ if TYPE_CHECKING:
 
 
 class Backend(Protocol):
-    """An entry point of the group `robotcell.backends`: a class with these two members."""
+    """An entry point of the group `robotcell.backends`: a class with these three members."""
 
     Options: type[BaseModel]
 
     @staticmethod
     def open(config: CellConfig) -> Devices:
         """The devices of a cell, not yet connected; `config.backend.options` fits `Options`."""
+        ...
+
+    @staticmethod
+    def cell_name(config: CellConfig) -> str | None:
+        """What names the cell beyond this process, the same however its file is written; None if it ends with it.
+
+        One process at a time opens a cell of a name, and a stop of it holds for the next one.
+        """
         ...
 
 

@@ -248,9 +248,9 @@ class JournalPlace(_Table):
         """The SQLite file that is the journal when no URL is given."""
         return self.runs / "journal.db"
 
-    def database_url(self) -> str:
-        """The SQLAlchemy URL of the journal."""
-        return self.url or f"sqlite:///{self.default_file}"
+    def database_url(self) -> str | Path:
+        """The SQLAlchemy URL of the journal, or the SQLite file where none is given: a path may hold any sign."""
+        return self.url or self.default_file
 
 
 class BackendChoice(_Table):

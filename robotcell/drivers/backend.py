@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
@@ -42,3 +43,14 @@ class HardwareBackend:
             D415(options.camera, config.camera, clock),
             clock,
         )
+
+    @staticmethod
+    def cell_name(config: CellConfig) -> str:
+        """The address of the arm's controller, whichever of its names the file uses."""
+        host = HardwareOptions.model_validate(config.backend.options).arm.host
+        try:
+            found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_STREAM)
+        except (OSError, UnicodeError):
+            # Whatever it is, connecting will say what is wrong with it.
+            return f"arm-{host.lower()}"
+        return f"arm-{min(str(address[4][0]) for address in found)}"

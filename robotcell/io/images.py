@@ -1,4 +1,4 @@
-"""Writing images."""
+"""Writing images, and reading them again."""
 
 from __future__ import annotations
 
@@ -36,3 +36,11 @@ def write_image(path: Path, image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise StorageError(f"{path} cannot be written: {error.strerror}; check the folder and the disk") from error
+
+
+def read_image(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | None:
+    """Read a PNG that `write_image` has written: (H, W, 3) uint8 RGB or (H, W); None if it is gone or no image."""
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if pixels is None:
+        return None
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB) if pixels.ndim == 3 else pixels  # type: ignore[return-value]

@@ -33,6 +33,14 @@ class Decision:
     action: Action
 
 
+class Hold(Protocol):
+    """Lets an operator hold a job between two of its actions, where the arm stands at home and the gripper is empty."""
+
+    def __call__(self) -> bool:
+        """Return at once, or wait until the job may go on; whether it waited, and the table may have changed."""
+        ...
+
+
 class Observer(Protocol):
     """Follows a job."""
 

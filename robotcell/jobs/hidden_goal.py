@@ -54,9 +54,10 @@ def place_after(
         result: of it.
         workspace: the map.
     """
-    if result in {Result.LOST, Result.UNCONFIRMED}:
-        return None
-    return place if isinstance(action, Grasp) else _pushed_along(place, action, workspace)
+    if isinstance(action, Grasp):
+        may_be_anywhere = result in {Result.LOST, Result.UNCONFIRMED, Result.UNKNOWN, Result.STOPPED}
+        return None if may_be_anywhere else place
+    return _pushed_along(place, action, workspace)
 
 
 def _pushed_along(place: npt.NDArray[np.bool_], push: Push, workspace: Workspace) -> npt.NDArray[np.bool_]:

@@ -5,31 +5,38 @@ A job is the loop around that line. What it did is in the journal; whoever wants
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from robotcell.errors import CellError, NoTarget, UnsafeMotion
-from robotcell.jobs.decision import Decision, Observer
-from robotcell.jobs.hidden_goal import place_after, uncover
-from robotcell.jobs.journal_tables import action_row, frame_row, outcome_row
+from robotcell.errors import CellError, NoTarget, StorageError, UnsafeMotion
+from robotcell.io.atomic_file import make_folder
+from robotcell.jobs.decision import Decision, Hold, Observer
+from robotcell.jobs.hidden_goal import uncover
+from robotcell.jobs.journal_tables import action_of, action_row, frame_row, outcome_row
 from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
-from robotcell.jobs.run_folder import make_run_dir, save_frame
-from robotcell.jobs.verdict import SCENE_CHANGED, Outcome, Result, judge
+from robotcell.jobs.progress import Progress
+from robotcell.jobs.resuming import check_resumable, cut_off, judge_resumed, replay, settle, task_of
+from robotcell.jobs.run_folder import load_frame, make_run_dir, save_frame
+from robotcell.jobs.verdict import Outcome, Result, judge
 from robotcell.motion.config_check import check_config
 from robotcell.motion.executor import Ending
-from robotcell.motion.push import Push
+from robotcell.motion.grasp import Grasp
+from robotcell.motion.retreat import at_home
 from robotcell.motion.way import plan_way
 from robotcell.perception.goals import find_goal
+from robotcell.perception.view import view_of
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable, Sequence
 
+    import numpy as np
     import numpy.typing as npt
 
     from robotcell.cell import Cell
     from robotcell.jobs.journal import Journal, Metrics
+    from robotcell.jobs.journal_tables import ActionRow
     from robotcell.jobs.policy_api import Policy, Task
     from robotcell.motion.actions import Action
     from robotcell.motion.path_check import CheckedPlan
@@ -39,8 +46,8 @@ if TYPE_CHECKING:
 # attempts end a run.
 MAX_PUSHES_IN_A_ROW = 5
 MAX_FAILURES_IN_A_ROW = 10
-# An arm this near to the home pose is at home.
-_AT_HOME_RAD = 0.01
+# Exit codes of commands that a signal ends, in words.
+_ENDED_BY = {129: "the terminal was closed", 143: "terminated"}
 
 
 @dataclass(frozen=True)
@@ -79,11 +86,20 @@ def run_job(
     journal: Journal,
     goals: tuple[str, ...] | None,
     observers: tuple[Observer, ...] = (),
+    hold: Hold | None = None,
 ) -> Report:
     """Pick the goals (colours) in their order, or with None everything on the table.
 
     A goal that is not on the table when its turn comes ends the job; the report's reason lists what is there. What
     hides a goal that was seen before is pushed aside.
+
+    Args:
+        cell: open.
+        policy: that decides.
+        journal: of the job.
+        goals: the words of the goals, in their order.
+        observers: follow it.
+        hold: asked before each action; see `Hold`.
 
     Raises:
         ConfigError: the configuration does not fit together.
@@ -92,25 +108,52 @@ def run_job(
             has it; after a motion was cut short, the cell's latch holds until `Cell.recover`.
     """
     check_config(cell.config)
+    cell.latch.check()
     run_dir = make_run_dir(cell.config.journal.runs, "-".join(goals) if goals else "all")
-    started = cell.clock.now()
-    status, reason = "stopped", ""
     # A database URL may hold a password.
     settings = cell.config.model_dump(mode="json", exclude={"journal": {"url"}})
-    job_id = journal.start_job(goals, policy.name, settings, run_dir)
-    try:
-        for observer in observers:
-            observer.started(job_id, run_dir)
-        job = _Job(cell, policy, journal, observers, job_id, run_dir)
-        reason = job.pick_in_order(goals) if goals else job.pick_all()
-        status = "incomplete" if reason else "complete"
-    except BaseException as error:
-        reason = _describe(error)
-        raise
-    finally:
-        cell_s = cell.clock.now() - started
-        journal.end_job(job_id, status, reason, cell_s)
-    return Report(job_id, run_dir, not reason, reason, journal.metrics(job_id), cell_s)
+    job_id = journal.start_job(goals, policy.name, settings, run_dir, cell.lock)
+    job = _Job(cell, policy, journal, observers, hold, job_id, run_dir, goals, cell.clock.now())
+    return job.run(job.start)
+
+
+def resume_job(
+    cell: Cell,
+    policy: Policy,
+    journal: Journal,
+    job_id: int,
+    observers: tuple[Observer, ...] = (),
+    hold: Hold | None = None,
+) -> Report:
+    """Go on with a job that was killed or stopped, whenever that was.
+
+    What the gripper holds is carried on into the bin. The table is looked at, and the action that was cut off is closed
+    with what can be told of it: what lies in the bin is counted once, whenever the job was cut off.
+
+    Args:
+        cell: in which the job ran; open, by `robotcell.open_cell`.
+        policy: that decided.
+        journal: of the job.
+        job_id: number of the job, the last one of this cell.
+        observers: follow it.
+        hold: asked before each action; see `Hold`.
+
+    Raises:
+        ConfigError: the job cannot be resumed here.
+        DeviceFault: the gripper holds something that the job did not take.
+        StorageError, ConnectionLost, GuardTripped, CalibrationError, UnsafeMotion: as `run_job`.
+    """
+    check_config(cell.config)
+    cell.latch.check()
+    row = journal.job(job_id)
+    lock = check_resumable(row, cell, policy.name, journal)
+    run_dir = Path(row.run_dir)
+    make_folder(run_dir)
+    journal.resume_job(job_id, lock)
+    began = cell.clock.now() - (row.cell_s or 0.0)
+    goals = tuple(row.goals) if row.goals else None
+    job = _Job(cell, policy, journal, observers, hold, job_id, run_dir, goals, began, len(row.actions))
+    return job.run(lambda: job.pick_up(row.actions))
 
 
 @dataclass
@@ -119,69 +162,91 @@ class _Job:
     policy: Policy
     journal: Journal
     observers: tuple[Observer, ...]
+    hold: Hold | None
     job_id: int
     run_dir: Path
+    goals: tuple[str, ...] | None
+    # On the cell's clock [s].
+    began: float
     actions: int = 0
+    progress: Progress = field(default_factory=Progress)
 
-    def pick_in_order(self, goals: tuple[str, ...]) -> str:
-        """Pick one goal after the other; "" or why it was given up."""
-        view = self._start()
-        for goal in goals:
-            view, reason = self._pick_until(goal, view)
-            if reason:
-                return reason
-        return ""
+    def run(self, start: Callable[[], View]) -> Report:
+        """Start or pick up the job, and work until it ends; how it ended is on record."""
+        try:
+            for observer in self.observers:
+                observer.started(self.job_id, self.run_dir)
+            reason = self.work(start())
+        except BaseException as error:
+            # What stopped the job says more than a journal that cannot be told of it.
+            with suppress(StorageError):
+                self.journal.end_job(self.job_id, "stopped", _describe(error), self.cell_s())
+            raise
+        self.journal.end_job(self.job_id, "incomplete" if reason else "complete", reason, self.cell_s())
+        return Report(self.job_id, self.run_dir, not reason, reason, self.journal.metrics(self.job_id), self.cell_s())
 
-    def pick_all(self) -> str:
-        """Pick until nothing is left; "" or why it was given up."""
-        _view, reason = self._pick_until(None, self._start())
-        return reason
+    def cell_s(self) -> float:
+        """How long the job has taken, on the cell's clock [s]."""
+        return self.cell.clock.now() - self.began
 
-    def _start(self) -> View:
+    def start(self) -> View:
         """Go home from wherever the arm stands, and look."""
-        off = np.abs(self.cell.arm.state().q - np.array(self.cell.config.motion.home_q)).max()
-        if off > _AT_HOME_RAD:
+        if not at_home(self.cell.arm.state(), self.cell.config):
             self.cell.home()
         return self._look()
+
+    def pick_up(self, rows: Sequence[ActionRow]) -> View:
+        """Settle what was cut off, look, and be where the job was."""
+        last = cut_off(rows)
+        action = action_of(last) if last else None
+        execution = None
+        if last is not None or not at_home(self.cell.arm.state(), self.cell.config):
+            note = (lambda label: self.journal.held(last.id, label)) if last else None
+            execution = settle(self.cell, action if isinstance(action, Grasp) else None, note)
+        after = self._look()
+
+        def recorded(row: ActionRow) -> View | None:
+            frame = load_frame(row.frame, after.frame)
+            return None if frame is None else view_of(frame, self.cell.config, self.policy.workspace)
+
+        self.progress = replay([row for row in rows if row is not last], recorded, self.policy.workspace)
+        if last is not None and action is not None:
+            before = recorded(last)
+            outcome = judge_resumed(last, action, before, after, execution)
+            task = task_of(last, before)
+            self._end_action(last.id, Decision(self.actions, last.goal, before or after, task, action), outcome)
+            self.progress = self.progress.after(last.goal, task, action, outcome, self.policy.workspace)
+        return after
+
+    def work(self, view: View) -> str:
+        """Act until everything is picked; "" or why it was given up."""
+        while True:
+            if self.goals is None:
+                goal, done = None, not view.segmentation.instances
+            else:
+                done = self.progress.goals == len(self.goals)
+                goal = None if done else self.goals[self.progress.goals]
+            if done:
+                return ""
+            if self.hold is not None and self.hold():
+                view = self._look()
+            try:
+                task = _task(view, goal, self.progress.place)
+                may_push = self.progress.pushes < MAX_PUSHES_IN_A_ROW or isinstance(task, Uncover)
+                action = self.policy.decide(_observe(view, task, self.progress.barred, may_push=may_push))
+            except NoTarget as error:
+                return str(error)
+            view, outcome = self._act(goal, view, task, action)
+            self.progress = self.progress.after(goal, task, action, outcome, view.heightmap.workspace)
+            if self.progress.failures >= MAX_FAILURES_IN_A_ROW:
+                failures = self.progress.failures
+                return f"given up after {failures} failed attempts in a row, the last one: {outcome.detail}"
 
     def _look(self) -> View:
         view = self.cell.look(self.policy.workspace)
         for observer in self.observers:
             observer.looked(view)
         return view
-
-    def _pick_until(self, goal: str | None, view: View) -> tuple[View, str]:
-        """Act until the goal (or, with None, everything) is picked; the last view, and why it was given up."""
-        failures = pushes = 0
-        # Where the goal may be if it is not seen any more.
-        place: npt.NDArray[np.bool_] | None = None
-        barred: tuple[Action, ...] = ()
-        while goal is not None or view.segmentation.instances:
-            try:
-                task = _task(view, goal, place)
-                may_push = pushes < MAX_PUSHES_IN_A_ROW or isinstance(task, Uncover)
-                action = self.policy.decide(_observe(view, task, barred, may_push=may_push))
-            except NoTarget as error:
-                return view, str(error)
-            if isinstance(task, PickGoal):
-                place = task.mask
-            view, outcome = self._act(goal, view, task, action)
-            if place is not None:
-                place = place_after(place, action, outcome.result, view.heightmap.workspace)
-            if not isinstance(task, Uncover):
-                pushes = pushes + 1 if isinstance(action, Push) else 0
-            # A push that moved something is no failure, but only a pick is what the attempts are for; while the goal
-            # is hidden, nothing else than failures ends the search.
-            if outcome.result is Result.PICKED:
-                failures = 0
-            elif not outcome.success or isinstance(task, Uncover):
-                failures += 1
-            barred = () if outcome.result in SCENE_CHANGED else (*barred, action)
-            if outcome.result is Result.PICKED and goal is not None:
-                return view, ""
-            if failures >= MAX_FAILURES_IN_A_ROW:
-                return view, f"given up after {failures} failed attempts in a row, the last one: {outcome.detail}"
-        return view, ""
 
     def _act(self, goal: str | None, view: View, task: Task, action: Action) -> tuple[View, Outcome]:
         """Run one action between its two rows of the journal; the view after it."""
@@ -190,31 +255,38 @@ class _Job:
         frame_id = self.journal.add_frame(
             frame_row(self.job_id, view.frame, view.heightmap, save_frame(view.frame, self.run_dir))
         )
-        action_id = self.journal.start_action(action_row(self.job_id, frame_id, goal, action, self.cell.clock.now()))
+        action_id = self.journal.start_action(
+            action_row(self.job_id, frame_id, goal, task, action, self.cell.clock.now())
+        )
         for observer in self.observers:
             observer.decided(decision)
         try:
-            after, outcome = self._run(decision)
+            after, outcome = self._run(action_id, decision)
         except BaseException as error:
             stopped = Outcome(Result.STOPPED, None, _describe(error), float("nan"), float("nan"))
-            self._end_action(action_id, decision, stopped)
+            # An action without an outcome is one that was cut off: the stop itself says more.
+            with suppress(StorageError):
+                self._end_action(action_id, decision, stopped)
             raise
         self._end_action(action_id, decision, outcome)
         return after, outcome
 
     def _end_action(self, action_id: int, decision: Decision, outcome: Outcome) -> None:
-        self.journal.end_action(outcome_row(action_id, outcome, self.cell.clock.now()))
-        for observer in self.observers:
-            observer.ended(decision, outcome)
+        try:
+            self.journal.end_action(outcome_row(action_id, outcome, self.cell.clock.now()), self.cell_s())
+        finally:
+            # Whoever follows the job is told what was done also where it cannot be recorded.
+            for observer in self.observers:
+                observer.ended(decision, outcome)
 
-    def _run(self, decision: Decision) -> tuple[View, Outcome]:
+    def _run(self, action_id: int, decision: Decision) -> tuple[View, Outcome]:
         cell, view = self.cell, decision.view
         try:
             q = cell.arm.state().q
             checked = plan_way(decision.action, view.heightmap, view.clearance, q, cell.config)
         except UnsafeMotion as error:
             return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan"))
-        execution = cell.executor.run(checked)
+        execution = cell.executor.run(checked, lambda label: self.journal.held(action_id, label))
         if execution.ending is not Ending.DONE:
             cell.home(view.clearance)
         after = self._look()
@@ -244,4 +316,6 @@ def _observe(view: View, task: Task, barred: tuple[Action, ...], *, may_push: bo
 def _describe(error: BaseException) -> str:
     if isinstance(error, CellError):
         return str(error)
-    return {KeyboardInterrupt: "interrupted", SystemExit: "terminated"}.get(type(error), repr(error))
+    if isinstance(error, SystemExit):
+        return _ENDED_BY.get(error.code, "terminated") if isinstance(error.code, int) else "terminated"
+    return "interrupted" if isinstance(error, KeyboardInterrupt) else repr(error)

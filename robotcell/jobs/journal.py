@@ -12,18 +12,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import create_engine, event, func, select
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from robotcell.errors import ConfigError, StorageError
 from robotcell.jobs.journal_schema import bring_up_to_date
-from robotcell.jobs.journal_tables import GRASP, ActionRow, Frame, Job, OutcomeRow
+from robotcell.jobs.journal_tables import GRASP, ActionRow, Frame, Job, OutcomeRow, StopRow
+from robotcell.jobs.ownership import owner
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from typing_extensions import Self
+
+    from robotcell.io.lock_file import LockFile
+
+
+# How long a SQLite file may be locked by others before that is an error. A write takes milliseconds; a stopped arm must
+# not wait long for its record.
+_LOCKED_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -51,26 +59,29 @@ class Journal:
     """The database of jobs; a context manager.
 
     Args:
-        url: any SQLAlchemy URL; the folder of a SQLite file is made.
+        url: any SQLAlchemy URL, or the path of a SQLite file; the folder of such a file is made.
 
     Raises:
         ConfigError: the URL is malformed, or the database is not one of this program or of a newer one.
         StorageError: the database cannot be opened or written.
     """
 
-    def __init__(self, url: str) -> None:
-        shown = url
+    def __init__(self, url: str | Path) -> None:
+        shown = str(url)
+        self._file: Path | None = None
         try:
-            parsed = make_url(url)
+            parsed = URL.create("sqlite", database=str(url)) if isinstance(url, Path) else make_url(url)
             # A URL may hold a password.
             shown = parsed.render_as_string(hide_password=True)
-            self._engine = create_engine(parsed)
+            waiting = {"timeout": _LOCKED_S} if parsed.get_backend_name() == "sqlite" else {}
+            self._engine = create_engine(parsed, connect_args=waiting)
         except (ArgumentError, ImportError, SQLAlchemyError) as error:
             raise ConfigError(f"journal.url = {shown!r}: the journal cannot be opened: {_cause(error)}") from error
         try:
             if parsed.get_backend_name() == "sqlite":
                 if parsed.database not in {None, "", ":memory:"}:
-                    Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
+                    self._file = Path(str(parsed.database))
+                    self._file.parent.mkdir(parents=True, exist_ok=True)
                 event.listen(self._engine, "connect", _use_write_ahead_log)
             bring_up_to_date(self._engine)
         except BaseException as error:
@@ -92,16 +103,31 @@ class Journal:
         """Release the database; idempotent."""
         self._engine.dispose()
 
-    def start_job(self, goals: Sequence[str] | None, policy: str, config: dict[str, Any], run_dir: Path) -> int:
-        """Record that a job starts; returns its id."""
+    def start_job(
+        self,
+        goals: Sequence[str] | None,
+        policy: str,
+        config: dict[str, Any],
+        run_dir: Path,
+        lock: LockFile | None = None,
+    ) -> int:
+        """Record that a job starts, in the process that holds `lock`; returns its id."""
         job = Job(
             started=_now(),
             goals=list(goals) if goals else None,
             policy=policy,
             config=config,
             run_dir=str(run_dir),
+            lock=lock.name if lock else None,
+            owner=owner(lock) if lock else None,
         )
         return self._add(job)
+
+    def resume_job(self, job_id: int, lock: LockFile) -> None:
+        """Record that a job goes on, in the process that holds `lock`."""
+        with self._writing() as session:
+            job = session.get_one(Job, job_id)
+            job.status, job.reason, job.ended, job.owner = "running", "", None, owner(lock)
 
     def end_job(self, job_id: int, status: str, reason: str, cell_s: float) -> None:
         """Record how a job ended."""
@@ -117,10 +143,43 @@ class Journal:
         """Record that an action starts; returns its id."""
         return self._add(action)
 
-    def end_action(self, outcome: OutcomeRow) -> None:
-        """Record what came of an action."""
+    def held(self, action_id: int, label: str) -> None:
+        """Record that the fingers held something at a check of an action that runs."""
         with self._writing() as session:
-            session.add(outcome)
+            session.get_one(ActionRow, action_id).held = label
+
+    def end_action(self, outcome: OutcomeRow, cell_s: float | None = None) -> None:
+        """Record what came of an action, in place of what was recorded of it when it was stopped.
+
+        Args:
+            outcome: of the action.
+            cell_s: how long the job has taken on the cell's clock [s].
+        """
+        with self._writing() as session:
+            session.merge(outcome)
+            if cell_s is not None:
+                session.get_one(ActionRow, outcome.action_id).job.cell_s = cell_s
+
+    def add_stop(self, stop: StopRow) -> None:
+        """Record a stop of a cell."""
+        self._add(stop)
+
+    def standing_stop(self, cell: str) -> StopRow | None:
+        """The newest stop of a cell that nobody has recovered from."""
+        with self._reading() as session:
+            standing = select(StopRow).where(StopRow.cell == cell, StopRow.cleared.is_(None))
+            return session.scalar(standing.order_by(StopRow.id.desc()).limit(1))
+
+    def clear_stops(self, cell: str) -> None:
+        """Record that an operator has recovered a cell."""
+        with self._writing() as session:
+            for stop in session.scalars(select(StopRow).where(StopRow.cell == cell, StopRow.cleared.is_(None))):
+                stop.cleared = _now()
+
+    def newest_job(self, lock: str) -> Job | None:
+        """The last job of a cell, by the name of its lock, without its actions."""
+        with self._reading() as session:
+            return session.scalar(select(Job).where(Job.lock == lock).order_by(Job.id.desc()).limit(1))
 
     def jobs(self, limit: int = 20) -> list[Job]:
         """The newest jobs first, without their actions."""
@@ -166,7 +225,7 @@ class Journal:
             picks_per_hour=3600 * successes / cell_s if cell_s else float("nan"),
         )
 
-    def _add(self, row: Job | Frame | ActionRow) -> int:
+    def _add(self, row: Job | Frame | ActionRow | StopRow) -> int:
         with self._writing() as session:
             session.add(row)
             session.flush()
@@ -182,6 +241,11 @@ class Journal:
 
     @contextmanager
     def _writing(self) -> Iterator[Session]:
+        if self._file is not None and not self._file.exists():
+            # SQLite would go on writing into a file that nobody can open any more.
+            raise StorageError(
+                f"the journal cannot be written: {self._file} was removed; put it back, then start again"
+            )
         try:
             with Session(self._engine, expire_on_commit=False) as session, session.begin():
                 yield session

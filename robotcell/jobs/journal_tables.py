@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy import JSON, ForeignKey
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
+from robotcell.jobs.policy_api import PickAny, PickGoal, Task, Uncover
 from robotcell.motion.grasp import Grasp
+from robotcell.motion.push import Push
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -22,8 +24,10 @@ if TYPE_CHECKING:
     from robotcell.motion.actions import Action
     from robotcell.perception.heightmap import Heightmap
 
-SCHEMA_REVISION = "0002"
+SCHEMA_REVISION = "0003"
 GRASP, PUSH = "grasp", "push"
+ANY, GOAL, UNCOVER = "any", "goal", "uncover"
+_TASKS: dict[type[Task], str] = {PickAny: ANY, PickGoal: GOAL, Uncover: UNCOVER}
 
 
 class Base(DeclarativeBase):
@@ -39,7 +43,7 @@ class Job(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     # UTC.
     started: Mapped[datetime]
-    # UTC; null while the job runs, and of one that was killed.
+    # UTC; null while the job runs, and of one that was interrupted.
     ended: Mapped[datetime | None]
     # Colours in order, or null for pick-all.
     goals: Mapped[list[str] | None] = mapped_column(JSON)
@@ -49,12 +53,16 @@ class Job(Base):
     config: Mapped[dict[str, Any]] = mapped_column(JSON)
     # Folder of the run.
     run_dir: Mapped[str]
-    # running, complete, incomplete or stopped.
+    # running, complete, incomplete or stopped. A job that was killed stays at running; its lock tells.
     status: Mapped[str] = mapped_column(default="running")
     # Why it is not complete.
     reason: Mapped[str] = mapped_column(default="")
-    # Duration on the cell's clock [s].
+    # Duration on the cell's clock up to the end of the last action, or of the job [s].
     cell_s: Mapped[float | None]
+    # Name of the lock that its process holds, which names the cell too; null where it holds none.
+    lock: Mapped[str | None]
+    # Which of the lock's holders its process is, as computer/token.
+    owner: Mapped[str | None]
     actions: Mapped[list[ActionRow]] = relationship(back_populates="job", order_by="ActionRow.id")
 
 
@@ -96,6 +104,8 @@ class ActionRow(Base):
     frame_id: Mapped[int] = mapped_column(ForeignKey("frames.id"))
     # The word of the goal that it was for; null for any object.
     goal: Mapped[str | None]
+    # What was to be done: any (pick any object), goal (pick the goal) or uncover; null of older journals.
+    task: Mapped[str | None]
     # grasp or push.
     primitive: Mapped[str]
     # Index k of the direction: k * 22.5 degrees about base z.
@@ -114,6 +124,8 @@ class ActionRow(Base):
     q_value: Mapped[float]
     # Time of the start on the cell's clock [s].
     started_s: Mapped[float]
+    # The last check at which the fingers held something, such as held over the bin; null before the first.
+    held: Mapped[str | None]
     job: Mapped[Job] = relationship(back_populates="actions")
     frame: Mapped[Frame] = relationship()
     outcome: Mapped[OutcomeRow | None] = relationship(back_populates="action")
@@ -143,6 +155,27 @@ class OutcomeRow(Base):
     action: Mapped[ActionRow] = relationship(back_populates="outcome")
 
 
+class StopRow(Base):
+    """A stop of a cell, after which nothing moves until an operator asks for robotcell recover."""
+
+    __tablename__ = "stops"
+
+    # The stop's number.
+    id: Mapped[int] = mapped_column(primary_key=True)
+    # Name of the cell.
+    cell: Mapped[str]
+    # What happened.
+    what: Mapped[str]
+    # UTC.
+    at: Mapped[datetime]
+    # Joint angles that were measured when the arm stood [rad]; null where they could not be.
+    q: Mapped[list[float] | None] = mapped_column(JSON)
+    # The job that was stopped; null outside of jobs.
+    job_id: Mapped[int | None] = mapped_column(ForeignKey("jobs.id"))
+    # When an operator recovered the cell, UTC; null as long as the stop stands.
+    cleared: Mapped[datetime | None]
+
+
 def frame_row(job_id: int, frame: RgbdFrame, heightmap: Heightmap, files: tuple[Path, Path]) -> Frame:
     """The row of a frame; `files` hold its colour and its depth."""
     table = heightmap.table
@@ -158,12 +191,13 @@ def frame_row(job_id: int, frame: RgbdFrame, heightmap: Heightmap, files: tuple[
     )
 
 
-def action_row(job_id: int, frame_id: int, goal: str | None, action: Action, started_s: float) -> ActionRow:
-    """The row of an action that starts at `started_s` on the cell's clock."""
+def action_row(job_id: int, frame_id: int, goal: str | None, task: Task, action: Action, started_s: float) -> ActionRow:
+    """The row of an action for a task, which starts at `started_s` on the cell's clock."""
     common = {
         "job_id": job_id,
         "frame_id": frame_id,
         "goal": goal,
+        "task": _TASKS[type(task)],
         "rotation": action.rotation,
         "q_value": action.q_value,
         "started_s": started_s,
@@ -172,6 +206,15 @@ def action_row(job_id: int, frame_id: int, goal: str | None, action: Action, sta
         return ActionRow(primitive=GRASP, x=action.x, y=action.y, surface_m=action.surface_m, **common)
     (x, y), (end_x, end_y) = action.start, action.end
     return ActionRow(primitive=PUSH, x=x, y=y, surface_m=action.top_m, end_x=end_x, end_y=end_y, **common)
+
+
+def action_of(row: ActionRow) -> Action | None:
+    """The action of a row; None for a push of the first schema, whose end is not known."""
+    if row.primitive == GRASP:
+        return Grasp(row.x, row.y, row.surface_m, row.rotation, row.q_value)
+    if row.end_x is None or row.end_y is None:
+        return None
+    return Push((row.x, row.y), (row.end_x, row.end_y), row.rotation, row.surface_m, row.q_value)
 
 
 def outcome_row(action_id: int, outcome: Outcome, ended_s: float) -> OutcomeRow:

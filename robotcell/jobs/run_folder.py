@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotcell.errors import StorageError
-from robotcell.io.images import write_image
+from robotcell.interfaces import RgbdFrame
+from robotcell.io.images import read_image, write_image
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from robotcell.interfaces import RgbdFrame
+    from robotcell.jobs.journal_tables import Frame
 
 # Finer than the unit of the camera, and 16 bits reach 6.5 m.
 _DEPTH_UNIT_M = 1e-4
@@ -50,3 +50,17 @@ def save_frame(frame: RgbdFrame, run_dir: Path) -> tuple[Path, Path]:
     for path, image in ((color_file, frame.color), (depth_file, depth)):
         write_image(path, image, compression=1)
     return color_file, depth_file
+
+
+def load_frame(row: Frame, like: RgbdFrame) -> RgbdFrame | None:
+    """A frame of an earlier look; None if its images are gone, or are of another mode of the camera.
+
+    Args:
+        row: of the frame.
+        like: a frame of the same camera; it has the intrinsics.
+    """
+    color, depth = read_image(Path(row.color_file)), read_image(Path(row.depth_file))
+    if color is None or depth is None or color.shape != like.color.shape or depth.shape != like.depth_m.shape:
+        return None
+    depth_m = (depth * _DEPTH_UNIT_M).astype(np.float32)
+    return RgbdFrame(row.t, row.number, color.astype(np.uint8), depth_m, like.intrinsics, like.serial)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from robotcell.motion.executor import Ending, Execution
-from robotcell.motion.grasp import HELD_AFTER_LIFT, Grasp
+from robotcell.motion.grasp import HELD_AFTER_LIFT, HELD_OVER_BIN, Grasp
 from robotcell.perception.goals import goal_color
 
 if TYPE_CHECKING:
@@ -43,11 +43,22 @@ class Result(str, enum.Enum):
     PUSHED = "pushed"
     NOTHING_MOVED = "nothing moved"
     REFUSED = "refused"  # the plan was unsafe; nothing moved
-    STOPPED = "stopped"  # a device or the safety layer stopped the cell
+    STOPPED = "stopped"  # a device, the safety layer or an operator stopped the cell
+    UNKNOWN = "unknown"  # the job was cut off meanwhile
 
 
 # After these the scene is another one, and what failed before may work now.
-SCENE_CHANGED = frozenset({Result.PICKED, Result.WRONG_OBJECT, Result.PUSHED, Result.LOST, Result.UNCONFIRMED})
+SCENE_CHANGED = frozenset(
+    {
+        Result.PICKED,
+        Result.WRONG_OBJECT,
+        Result.PUSHED,
+        Result.LOST,
+        Result.UNCONFIRMED,
+        Result.STOPPED,
+        Result.UNKNOWN,
+    }
+)
 
 
 @dataclass(frozen=True)
@@ -93,6 +104,27 @@ def judge(action: Action, goal: str | None, before: View, after: View, execution
     return Outcome(result, picked, detail, execution.peak_force_n, execution.grip_force_n)
 
 
+def judge_cut_off(action: Action, goal: str | None, before: View | None, after: View, held: str | None) -> Outcome:
+    """What an action came to that was cut off, the gripper being empty now.
+
+    Args:
+        action: that was cut off.
+        goal: the word of the goal that it was for; None for any object.
+        before: what it was decided on; None if its pictures are gone.
+        after: what is seen now.
+        held: label of the last check at which the fingers held something; None before the first.
+    """
+    result, picked, detail = Result.UNKNOWN, None, "the table does not tell what came of it"
+    if isinstance(action, Grasp) and before is not None:
+        taken = _taken(action, before, after)
+        if held == HELD_OVER_BIN:
+            # After this the fingers open nowhere else than over the bin.
+            result, picked, detail = _judge_taken(taken, goal)
+        elif taken is not None:
+            result, detail = Result.LOST, f"{taken.color_name} is neither in its place nor in the gripper"
+    return Outcome(result, picked, f"cut off; {detail}", float("nan"), float("nan"))
+
+
 def _judge_grasp(
     grasp: Grasp, goal: str | None, before: View, after: View, execution: Execution
 ) -> tuple[Result, str | None, str]:
@@ -102,13 +134,18 @@ def _judge_grasp(
     if execution.ending is Ending.EMPTY:
         result = Result.MISSED if execution.step == HELD_AFTER_LIFT else Result.LOST
         return result, None, f"the fingers were {width} apart at {execution.step!r}"
-    taken = _taken(grasp, before, after)
+    result, picked, detail = _judge_taken(_taken(grasp, before, after), goal)
+    return result, picked, f"{detail}, held {width} wide" if result is Result.PICKED else detail
+
+
+def _judge_taken(taken: Instance | None, goal: str | None) -> tuple[Result, str | None, str]:
+    """What a grasp came to that held something over the bin, by what is missing on the table."""
     if taken is None:
         return Result.UNCONFIRMED, None, "something was held, but nothing is missing on the table"
     picked = taken.color_name
     if goal is not None and picked != goal_color(goal):
         return Result.WRONG_OBJECT, picked, f"took {picked} instead of {goal}"
-    return Result.PICKED, picked, f"{picked}, held {width} wide"
+    return Result.PICKED, picked, picked
 
 
 def _taken(grasp: Grasp, before: View, after: View) -> Instance | None:

@@ -16,6 +16,8 @@ from robotcell.motion.guard import Guard, Latch
 from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Devices
@@ -79,8 +81,12 @@ class Executor:
         self._latch = latch
         self._guard = Guard(config, latch)
 
-    def run(self, checked: CheckedPlan) -> Execution:
+    def run(self, checked: CheckedPlan, held: Callable[[str], None] | None = None) -> Execution:
         """Run a plan to its end, or to the first contact or empty grip.
+
+        Args:
+            checked: the plan.
+            held: called with the label of each `CheckHold` that something was held at, before the next step.
 
         However this ends, by an exception or by an interrupt as well, arm and fingers stand still afterwards, and
         whatever ended it early is latched.
@@ -91,13 +97,21 @@ class Executor:
         plan = checked.plan
         self._guard.check_start(self._devices.arm.state(), self._devices.clock.now(), plan)
         try:
-            return self._run_steps(checked)
+            return self._run_steps(checked, held)
         except BaseException as error:
             self._latch.trip(f"{plan.label} was cut short: {error if str(error) else type(error).__name__}")
             self._stop()
+            unkept = self._latch.keep(self._measured_joints())
+            if unkept and isinstance(error, CellError):
+                raise type(error)(f"{error}; {unkept}", device=error.device) from error
             raise
 
-    def _run_steps(self, checked: CheckedPlan) -> Execution:
+    def _measured_joints(self) -> Array | None:
+        with suppress(CellError):
+            return self._devices.arm.state().q
+        return None
+
+    def _run_steps(self, checked: CheckedPlan, held: Callable[[str], None] | None) -> Execution:
         peak_force, grip_force, width = 0.0, math.nan, math.nan
         ending, label = Ending.DONE, ""
         for step, path in zip(checked.plan.steps, checked.joint_paths, strict=True):
@@ -107,6 +121,8 @@ class Executor:
                 if width < step.min_width_m:
                     ending = Ending.EMPTY
                     break
+                if held is not None:
+                    held(label)
                 continue
             if isinstance(step, Grip):
                 contact, force = self._grip(step, checked.lowest_tip_m)

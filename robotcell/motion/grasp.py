@@ -28,8 +28,11 @@ if TYPE_CHECKING:
 GRASP_DEPTH_M = 0.040
 # A load gripped 4 cm below its top reaches at most this far below the tcp (the tallest block is 100 mm).
 LOAD_REACH_M = 0.060
+_TOP_NOISE_M = 0.010
 # Label of the first check for a held object; one that passes here and fails later was lost on the way.
 HELD_AFTER_LIFT = "held after the lift"
+# Label of the second one; what passes here is let go into the bin next.
+HELD_OVER_BIN = "held over the bin"
 # A load is lifted until it would pass this high over the walls of the bin.
 _CARRY_CLEARANCE_M = 0.03
 # The finger tips are this high over the walls of the bin when they let go.
@@ -91,8 +94,7 @@ def plan_grasp(
     table, use, motion = config.table.height_m, config.gripper, config.motion
     tcp_z = table + grasp_height(grasp.surface_m, config)
     approach_z = tcp_z + motion.approach_m
-    # The load may reach down to the table that it stands on.
-    load_m = max(LOAD_REACH_M, tcp_z - table)
+    load_m = load_reach(grasp, config)
     touch_m = touch_height(grasp.surface_m)
     top_z = approach_z
     if q_above is None:
@@ -102,14 +104,12 @@ def plan_grasp(
     # The symmetric jaw may have been turned by half a turn to stay near the home pose.
     T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
     T_near, T_grasp, T_lifted = (T_above.copy() for _ in range(3))
-    # Over the walls of the bin, and over where the load itself stood, which the map still shows.
-    over_m = max(config.bin.wall_height_m, grasp.surface_m if load_m > LOAD_REACH_M else 0.0)
-    T_lifted[2, 3] = max(top_z, table + over_m + load_m + _CARRY_CLEARANCE_M)
+    T_lifted[2, 3] = max(top_z, table + carry_height(config, load_m))
+    if load_m > LOAD_REACH_M:
+        # Over where the load itself stood, which the map of clearance still shows.
+        T_lifted[2, 3] = max(T_lifted[2, 3], tcp_z + GRASP_DEPTH_M + load_m + _CARRY_CLEARANCE_M)
     T_near[2, 3] = near_height(heightmap, grasp.x, grasp.y, grasp.theta, use.preshape_m, tcp_z, config)
     T_grasp[2, 3] = tcp_z
-    bin_x, bin_y = _release_point(grasp.x, grasp.y, config)
-    bin_z = table + config.bin.wall_height_m + _BIN_CLEARANCE_M + load_m - LOAD_REACH_M
-    q_bin = solve_tool_down("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
     steps: tuple[Step, ...] = (
         Grip("pre-shape", use.preshape_m, use.force_n),
         joint_move("approach", q_above, config),
@@ -119,12 +119,44 @@ def plan_grasp(
         Grip("close", rg2.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
         linear_move("lift", T_lifted, config, load_m, touch_m),
         CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
+        *_carry(grasp, config),
+    )
+    return MotionPlan("grasp", q_start, steps)
+
+
+def plan_carry(grasp: Grasp, q_start: Array, config: CellConfig) -> MotionPlan:
+    """The last part of a grasp's motion, from `q_start` (6,) [rad] where what it took is held high enough already.
+
+    Raises:
+        UnsafeMotion: a pose is out of reach.
+    """
+    return MotionPlan("carry", q_start, _carry(grasp, config))
+
+
+def load_reach(grasp: Grasp, config: CellConfig) -> float:
+    """How far below the tcp [m] what a grasp takes reaches at most: down to the table that it stands on."""
+    reach = grasp_height(grasp.surface_m, config)
+    # The top of the tallest block is seen some millimetres too high at times.
+    return reach if reach > LOAD_REACH_M + _TOP_NOISE_M else LOAD_REACH_M
+
+
+def carry_height(config: CellConfig, load_m: float = LOAD_REACH_M) -> float:
+    """Height of the tcp above the table [m] from which on a load passes over the walls of the bin."""
+    return config.bin.wall_height_m + load_m + _CARRY_CLEARANCE_M
+
+
+def _carry(grasp: Grasp, config: CellConfig) -> tuple[Step, ...]:
+    use = config.gripper
+    bin_x, bin_y = _release_point(grasp.x, grasp.y, config)
+    load_m = load_reach(grasp, config)
+    bin_z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M + load_m - LOAD_REACH_M
+    q_bin = solve_tool_down("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
+    return (
         joint_move("carry to bin", q_bin, config, load_m),
-        CheckHold("held over the bin", use.empty_width_m),
+        CheckHold(HELD_OVER_BIN, use.empty_width_m),
         Grip("release", use.preshape_m, use.force_n),
         home_move(config),
     )
-    return MotionPlan("grasp", q_start, steps)
 
 
 def _release_point(x: float, y: float, config: CellConfig) -> tuple[float, float]:

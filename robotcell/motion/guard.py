@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from robotcell.errors import DeviceFault, GuardTripped, UnsafeMotion
+from robotcell.errors import CellError, DeviceFault, GuardTripped, UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.interfaces import ArmMode, ArmState
 from robotcell.motion.path_check import outside_box
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
+    from robotcell.geometry.transforms import Array
     from robotcell.motion.plan import MotionPlan
 
 # The measured arm may be this far from where a plan starts (settled position error of a UR5e is far below it).
@@ -24,29 +27,112 @@ _BOX_SLACK_M = 0.005
 _CLOCK_SLACK_S = 0.01
 
 
-class Latch:
-    """Remembers a safety violation until an operator clears it. Every executor of a cell shares it."""
+@dataclass(frozen=True)
+class Stop:
+    """A stop after which nothing moves until an operator asks for `recover`.
 
-    def __init__(self) -> None:
-        self._violation: str | None = None
+    Attributes:
+        what: happened, in a sentence.
+        at: when, UTC.
+        q: joint angles (6,) [rad] that were measured when the arm stood; None where they could not be.
+        job: number of the job that was stopped; None outside of jobs.
+    """
+
+    what: str
+    at: datetime
+    q: Array | None = None
+    job: int | None = None
+
+
+class StopStore(Protocol):
+    """What keeps the stop of a cell for the next process. Each method raises StorageError."""
+
+    def load(self) -> Stop | None:
+        """The stop that stands; None if there is none."""
+        ...
+
+    def save(self, stop: Stop) -> None:
+        """Keep a stop."""
+        ...
+
+    def clear(self) -> None:
+        """No stop stands any more."""
+        ...
+
+
+class Latch:
+    """Remembers a safety stop until an operator clears it. Every executor of a cell shares it.
+
+    Args:
+        store: keeps the stop beyond this process; None for a cell that ends with it.
+    """
+
+    def __init__(self, store: StopStore | None = None) -> None:
+        self._store = store
+        self._stop: Stop | None = None
+
+    @property
+    def stop(self) -> Stop | None:
+        """The stop that stands; None if there is none."""
+        return self._stop
 
     @property
     def violation(self) -> str | None:
         """What tripped it, or None."""
-        return self._violation
+        return self._stop.what if self._stop else None
+
+    def load(self) -> None:
+        """Take over what an earlier process left.
+
+        Raises:
+            StorageError, ConfigError: its store cannot be read.
+        """
+        if self._store is not None and self._stop is None:
+            self._stop = self._store.load()
 
     def trip(self, what: str) -> None:
-        """Latch a violation; the first one stands."""
-        self._violation = self._violation or what
+        """Latch a violation, in memory: the arm still has to be stopped. The first one stands."""
+        if self._stop is None:
+            self._stop = Stop(what, datetime.now(timezone.utc))
+
+    def keep(self, q: Array | None) -> str:
+        """Have the store keep the stop, once the arm stands.
+
+        Args:
+            q: measured joint angles (6,) [rad]; None where they cannot be had.
+
+        Returns:
+            "", or why the store could not: the stop then ends with this process.
+        """
+        if self._stop is None:
+            return ""
+        self._stop = replace(self._stop, q=q)
+        try:
+            if self._store is not None:
+                self._store.save(self._stop)
+        except CellError as error:
+            return (
+                f"the stop could not be recorded ({error}), so other programs do not know of it: run robotcell recover "
+                "before any of them"
+            )
+        return ""
 
     def clear(self) -> None:
-        """Forget the violation. Only ever called because an operator asked for it."""
-        self._violation = None
+        """Forget the stop. Only ever called because an operator asked for it.
+
+        Raises:
+            StorageError: the store still has it, and so has this latch.
+        """
+        if self._store is not None:
+            self._store.clear()
+        self._stop = None
 
     def check(self) -> None:
         """Raise GuardTripped if a violation is latched."""
-        if self._violation:
-            raise GuardTripped(f"nothing moves after a safety stop ({self._violation}); look at the cell, then recover")
+        if self._stop is not None:
+            raise GuardTripped(
+                f"nothing moves after a safety stop ({self._stop.what}); look at the cell, then run robotcell recover"
+            )
 
 
 class Guard:

@@ -95,6 +95,6 @@ def guarded_move(label: str, T_base_tcp: Array, config: CellConfig, touch_m: flo
     return LinearMove(label, T_base_tcp, speed, acceleration, motion.contact_force_n, touch_m=touch_m)
 
 
-def home_move(config: CellConfig) -> JointMove:
-    """The motion to the home pose."""
-    return joint_move("home", np.array(config.motion.home_q), config)
+def home_move(config: CellConfig, load_m: float = 0.0) -> JointMove:
+    """The motion to the home pose; see `JointMove`."""
+    return joint_move("home", np.array(config.motion.home_q), config, load_m)

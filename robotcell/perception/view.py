@@ -67,9 +67,16 @@ def look(devices: Devices, config: CellConfig, workspace: Workspace | None = Non
         )
     if config.camera.measured is not None:
         check_tags(frame.color, config.camera.measured.tags)
+    view = view_of(frame, config, workspace)
+    _check_coverage(view.heightmap, limits.min_coverage)
+    _check_table(view.heightmap, config)
+    return view
+
+
+def view_of(frame: RgbdFrame, config: CellConfig, workspace: Workspace) -> View:
+    """What a frame shows, of now or of a recorded look, on the map of a workspace; nothing is checked."""
+    camera = CalibratedCamera.of(config.camera)
     heightmap = build_heightmap(frame, camera, workspace, config.table.height_m)
-    _check_coverage(heightmap, limits.min_coverage)
-    _check_table(heightmap, config)
     clearance = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),))
     return View(frame, camera, heightmap, segment(heightmap), clearance)
 

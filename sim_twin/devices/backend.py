@@ -26,6 +26,10 @@ class TwinBackend:
         """The twin's devices, not yet connected."""
         return open_twin(config)[0].devices
 
+    @staticmethod
+    def cell_name(config: CellConfig) -> None:
+        """None: the world is this process's own, and a stop in it ends with it."""
+
 
 def open_twin(config: CellConfig, scene: Scene | None = None) -> tuple[Cell, World]:
     """The twin of a configuration, not yet connected, and the world behind it, to score results by.
