@@ -93,8 +93,16 @@ def test_the_same_seed_gives_the_same_job_to_the_last_action(tmp_path: Path) -> 
     assert once("first") == once("second")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_job_that_is_cut_off_is_on_record_as_stopped(cell: Path, number: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        (signal.SIGINT, 130, "interrupted"),
+        (signal.SIGHUP, 129, "the terminal was closed"),
+    ],
+)
+def test_a_job_that_is_cut_off_is_on_record_as_stopped(
+    cell: Path, number: signal.Signals, code: int, words: str
+) -> None:
     command = [sys.executable, "-c", "from cli.main import main; main()", "pick", "--all", "--cell", str(cell)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
         assert process.stderr is not None
@@ -105,7 +113,7 @@ def test_a_job_that_is_cut_off_is_on_record_as_stopped(cell: Path, number: signa
         assert process.wait() == code
     shown = run("jobs", "show", "1", "--cell", cell).stdout
     assert "stopped" in shown
-    assert ("interrupted" if number is signal.SIGINT else "terminated") in shown
+    assert words in shown
 
 
 def test_a_dry_run_draws_and_moves_nothing(cell: Path, tmp_path: Path) -> None:
