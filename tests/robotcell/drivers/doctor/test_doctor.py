@@ -48,7 +48,7 @@ def cell_text(host: str) -> str:
 @pytest.fixture
 def cell_file(tmp_path: Path) -> Path:
     path = tmp_path / "cell.toml"
-    path.write_text(cell_text(HOST))
+    path.write_text(f'{cell_text(HOST)}[journal]\nruns = "{tmp_path / "runs"}"\n')
     return path
 
 
@@ -125,12 +125,18 @@ def test_recover_asks_first_and_then_leaves_the_stop(served: ServedCell, cell_fi
         served.inject(fault("state", Kind.WRONG, "program_paused"))
         wait_until(lambda: arm.state().mode is ArmMode.NOT_READY)
         runner = CliRunner()
-        refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input="n\n")
-        assert refused.exit_code == 3
-        assert arm.state().mode is ArmMode.NOT_READY
+        for answer in ("n\n", ""):
+            refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input=answer)
+            assert refused.exit_code == 3
+            assert "nothing moved" in refused.stderr
+            assert arm.state().mode is ArmMode.NOT_READY
     left = runner.invoke(app, ["recover", "--cell", str(cell_file), "--yes"])
     assert left.exit_code == 0, left.output
-    assert "ready" in left.output
+    assert "a device is stopped" in left.stderr
+    assert "the arm is ready, and no stop stands" in left.stdout
+    again = runner.invoke(app, ["recover", "--cell", str(cell_file), "--yes"])
+    assert again.exit_code == 0, again.output
+    assert "nothing to recover from" in again.stdout
     with make_arm() as arm:
         assert arm.state().mode is ArmMode.READY
 
