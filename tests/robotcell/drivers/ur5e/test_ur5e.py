@@ -127,9 +127,11 @@ def test_the_arm_stands_when_our_own_process_dies(served: ServedCell, arm: UR5e,
     owner = subprocess.Popen([sys.executable, "-c", OWNER, HOST], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     with owner:
         assert owner.stdout is not None
-        child = int(owner.stdout.readline())
-        took = stands_after(served, lambda: os.kill(owner.pid, number))
-        owner.kill()
+        try:
+            child = int(owner.stdout.readline())
+            took = stands_after(served, lambda: os.kill(owner.pid, number))
+        finally:
+            owner.kill()
     # One that hangs is noticed after 0.2 s without a kick.
     assert took < (STANDS_S if number is signal.SIGKILL else STANDS_S + 0.2)
     wait_until(lambda: not psutil.pid_exists(child))
