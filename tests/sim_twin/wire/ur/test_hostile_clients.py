@@ -50,8 +50,8 @@ NAMES = st.sampled_from(
     re.findall(
         r"\w+",
         """movej movel movep stopj stopl speedj speedl servoj sleep sync set_tcp set_payload set_target_payload textmsg
-        popup set_digital_out set_tool_digital_out set_analog_out write_output_integer_register write_output_float_register
-        write_output_boolean_register zero_ftsensor protective_stop freedrive_mode end_freedrive_mode halt fly""",
+        popup set_digital_out set_tool_digital_out set_analog_out write_output_integer_register halt fly zero_ftsensor
+        write_output_float_register write_output_boolean_register protective_stop freedrive_mode end_freedrive_mode""",
     )
 )
 CALLS = st.builds(lambda name, values: f"{name}({','.join(map(str, values))})", NAMES, st.lists(VALUES, max_size=5))
