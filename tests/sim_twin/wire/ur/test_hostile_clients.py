@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from sim_twin.wire.ur.launch import launch
 from tests.sim_twin.wire.ur.rtde_client import reading
-from tests.sim_twin.wire.ur.stepped_controller import SteppedController, received
+from tests.sim_twin.wire.ur.stepped_controller import SteppedController, SteppedControlLoop, received
 from tests.sim_twin.wire.ur.stub_world import ServedController
 
 if TYPE_CHECKING:
@@ -50,8 +50,8 @@ NAMES = st.sampled_from(
     re.findall(
         r"\w+",
         """movej movel movep stopj stopl speedj speedl servoj sleep sync set_tcp set_payload set_target_payload textmsg
-        popup set_digital_out set_tool_digital_out set_analog_out write_output_integer_register write_output_float_register
-        write_output_boolean_register zero_ftsensor protective_stop freedrive_mode end_freedrive_mode halt fly""",
+        popup set_digital_out set_tool_digital_out set_analog_out write_output_integer_register halt fly zero_ftsensor
+        write_output_float_register write_output_boolean_register protective_stop freedrive_mode end_freedrive_mode""",
     )
 )
 CALLS = st.builds(lambda name, values: f"{name}({','.join(map(str, values))})", NAMES, st.lists(VALUES, max_size=5))
@@ -70,6 +70,18 @@ def test_statements_with_any_arguments_run_or_are_refused(calls: list[str]) -> N
             launch(stepped.controller, one)
         stepped.tick(3)
     assert stepped.controller.ticks == 9
+
+
+WILD = st.one_of(st.floats(-10, 10), st.sampled_from([0.0, 1e300, -1e300, float("inf"), float("nan")]))
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 300), st.lists(WILD, max_size=18), st.lists(st.integers(-(2**31), 2**31 - 1), max_size=7))
+def test_the_control_loop_survives_any_registers(command: int, doubles: list[float], ints: list[int]) -> None:
+    stepped = SteppedControlLoop()
+    stepped.set(command, doubles, ints)
+    stepped.tick(3)
+    assert stepped.controller.ticks == 4
 
 
 @pytest.fixture(scope="module")
