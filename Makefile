@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.11 python3.10 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 12))' 2>/dev/null && echo $$p && break; done)
 
-.PHONY: demo test test-wire check bench docs setup clean
+.PHONY: demo test test-wire check bench docs audit setup clean
 
 demo: setup
 	$(BIN)/robotcell pick --goal red --cell examples/cell.toml
@@ -34,6 +34,11 @@ docs: $(VENV)/.docs-installed
 $(VENV)/.docs-installed: $(VENV)/.installed
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[docs]'
 	@touch $@
+
+# Installed libraries against known advisories. Needs the network.
+audit: setup
+	$(BIN)/python -m pip install --quiet 'pip-audit>=2.7,<3'
+	$(BIN)/python -m pip_audit --skip-editable
 
 setup: $(VENV)/.installed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -17,6 +18,10 @@ if TYPE_CHECKING:
 
 # A runner in the background ignores SIGINT, and so would every process that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Processes that tests start need not compile again what one of them has compiled, whatever the machine's habits are.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Examples are derived from the test itself, so a run is repeatable; a shared machine makes deadlines meaningless.
 settings.register_profile("repeatable", derandomize=True, deadline=None)

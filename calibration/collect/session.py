@@ -21,12 +21,13 @@ import numpy as np
 from pydantic import AwareDatetime, BaseModel, ConfigDict
 
 from calibration.solve.readers.corner_record import CornerRecord, parse_board, views_of_corners
-from calibration.solve.readers.json_file import read_json, validate
+from calibration.solve.readers.validation import validate
 from calibration.solve.readers.view_file import read_file
 from robotcell.config.calibration_file import CameraModel, CharucoBoard, Mount, PointBoard
 from robotcell.errors import ConfigError
 from robotcell.io.atomic_file import make_folder, write_whole
 from robotcell.io.images import write_image
+from robotcell.io.input_file import MEASUREMENTS_MAX_BYTES, read_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -208,7 +209,7 @@ def load_header(folder: Path) -> SessionHeader:
     path = folder / _HEADER
     if not path.exists():
         raise ConfigError(f"{folder}: no session folder: it has no {_HEADER}")
-    values = read_json(path)
+    values = read_json(path, MEASUREMENTS_MAX_BYTES)
     if isinstance(values, dict) and values.get("version", 1) != 1:
         raise ConfigError(f"{path}: version {values['version']}; this program reads 1")
     if isinstance(values, dict) and "board" in values:
@@ -223,7 +224,7 @@ def load_records(folder: Path) -> list[ViewRecord]:
         ConfigError: a file of a view is wrong.
     """
     paths = sorted((folder / _VIEWS).glob("*.json"))
-    return [validate(ViewRecord, read_json(path), str(path)) for path in paths]
+    return [validate(ViewRecord, read_json(path, MEASUREMENTS_MAX_BYTES), str(path)) for path in paths]
 
 
 def image_path(folder: Path, name: str) -> Path:

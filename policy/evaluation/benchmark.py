@@ -27,6 +27,7 @@ from policy.rollouts import run_tasks
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError
 from robotcell.io.atomic_file import make_folder, replaced, write_whole
+from robotcell.io.input_file import MEASUREMENTS_MAX_BYTES, SETTINGS_MAX_BYTES, read_json, read_text
 from robotcell.jobs.run_folder import make_run_dir
 from robotcell.motion.config_check import check_config
 
@@ -134,12 +135,7 @@ def load(folder: Path) -> tuple[Settings, Origin]:
         ConfigError: the folder holds none, or one of another version.
     """
     path = folder / _SETTINGS_FILE
-    try:
-        head = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; --resume names the folder of a benchmark") from error
-    except ValueError as error:
-        raise ConfigError(f"{path}: not of a benchmark: {error}") from error
+    head = read_json(path, SETTINGS_MAX_BYTES, "--resume names the folder of a benchmark")
     try:
         if head["version"] != FORMAT_VERSION:
             raise ConfigError(f"{path}: version {head['version']}; this program continues version {FORMAT_VERSION}")
@@ -162,7 +158,7 @@ def finished(folder: Path, trials: Sequence[Trial]) -> list[TrialResult]:
     results = {}
     path = folder / _TRIALS_FILE
     if path.exists():
-        *lines, _rest = path.read_text(encoding="utf-8").split("\n")
+        *lines, _rest = read_text(path, MEASUREMENTS_MAX_BYTES).split("\n")
         for number, line in enumerate(lines, start=1):
             try:
                 result = _result(json.loads(line))

@@ -21,6 +21,7 @@ from policy.network.encoding import RESOLUTION_M
 from policy.network.registry import make_network
 from robotcell.errors import ConfigError
 from robotcell.io.atomic_file import replaced
+from robotcell.io.input_file import read_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,6 +37,8 @@ _FORMAT = "1"
 _RESERVED = {"format", "architecture", "resolution_m", "sha256"}
 # A file that would be larger holds its convolutions as float16.
 _LARGE_BYTES = 8_000_000
+# The paper's network, the largest of all, takes 74 MB as float32.
+_MAX_BYTES = 256_000_000
 
 
 def save_weights(path: Path, network: nn.Module, architecture: str, card: Mapping[str, str]) -> None:
@@ -121,10 +124,7 @@ def load_named(name: str, folder: Traversable | None = None) -> tuple[nn.Module,
 
 def _read(path: Path, what: str) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata of any safetensors file."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{what}: cannot be read ({error.strerror}); name a file that exists") from error
+    content = read_bytes(path, _MAX_BYTES, "name one that exists, or train one")
     try:
         tensors = safetensors.torch.load(content)
         # The header is JSON after its length in eight bytes; the reader of bytes gives only the tensors.

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from robotcell.config import read_toml, wrong_values
+from robotcell.config import wrong_values
 from robotcell.errors import ConfigError
+from robotcell.io.input_file import read_toml
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -198,7 +199,7 @@ def load_train_config(path: Path | None = None) -> TrainConfig:
     """
     if path is None:
         return TrainConfig()
-    values = read_toml(path, "examples/train.toml")
+    values = read_toml(path, "start from examples/train.toml")
     for name in ("stage1", "stage2"):
         given = values.get(name)
         if isinstance(given, dict):

@@ -1,7 +1,7 @@
 """`cell.toml` and the calibration file: what a cell is, read and checked."""
 
 from robotcell.config.backends import Backend, find_backend
-from robotcell.config.cell_file import load_config, parse_setting, read_toml, wrong_values
+from robotcell.config.cell_file import load_config, parse_setting, wrong_values
 from robotcell.config.schema import (
     BackendChoice,
     Bin,
@@ -28,6 +28,5 @@ __all__ = [
     "find_backend",
     "load_config",
     "parse_setting",
-    "read_toml",
     "wrong_values",
 ]

@@ -6,7 +6,6 @@ Metres, radians; errors in millimetres, degrees and pixels, as their names say.
 
 from __future__ import annotations
 
-import json
 from datetime import datetime, timedelta, timezone
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
@@ -16,11 +15,14 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 from robotcell.errors import CalibrationError, ConfigError
 from robotcell.geometry.transforms import Array, check_transform
 from robotcell.io.atomic_file import make_folder, write_whole
+from robotcell.io.input_file import read_json
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 VERSION = 1
+# One with all its views and tags is below 100 kB.
+_MAX_BYTES = 16_000_000
 # A camera on a post moves when somebody leans on it; half a year is about how long nobody remembers.
 MAX_AGE = timedelta(days=180)
 
@@ -286,14 +288,7 @@ def load_calibration(path: Path) -> CameraCalibration:
     Raises:
         ConfigError: it cannot be read or is none; the message names every wrong key.
     """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; make one with robotcell calibrate") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a JSON file: {error}") from error
+    values = read_json(path, _MAX_BYTES, "make one with robotcell calibrate")
     version = values.get("version") if isinstance(values, dict) else None
     if version is None:
         raise ConfigError(f"{path}: not a calibration file: it has no version")

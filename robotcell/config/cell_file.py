@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
@@ -10,11 +9,7 @@ from pydantic import ValidationError
 from robotcell.config.backends import find_backend
 from robotcell.config.schema import BackendChoice, CellConfig
 from robotcell.errors import ConfigError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from robotcell.io.input_file import parse_toml, read_toml
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,7 +33,7 @@ def load_config(
     Raises:
         ConfigError: naming every bad key at once, each with its value and what is allowed.
     """
-    values = read_toml(path, "examples/cell.toml") if path else {}
+    values = read_toml(path, "start from examples/cell.toml") if path else {}
     if path:
         _beside(values, path)
     for key, value in (overrides or {}).items():
@@ -78,30 +73,9 @@ def parse_setting(text: str) -> tuple[str, Any]:
     if not equals or not all(part.isidentifier() for part in key.split(".")):
         raise ConfigError(f"--set {text}: say KEY=VALUE, such as limits.force_n=80; see {_DOCS}")
     try:
-        return key, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        return key, parse_toml(f"value = {value}", "--set")["value"]
+    except ConfigError:
         return key, value.strip()
-
-
-def read_toml(path: Path, example: str) -> dict[str, Any]:
-    """The values of a TOML file.
-
-    Args:
-        path: of the file.
-        example: a file to start from, named where there is none.
-
-    Raises:
-        ConfigError: it cannot be read, or is no TOML.
-    """
-    try:
-        values: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-        return values
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file; start from {example}") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not a TOML file: {error}") from error
 
 
 def wrong_values(error: ValidationError, docs: str, prefix: tuple[str, ...] = ()) -> list[str]:

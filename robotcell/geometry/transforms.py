@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from robotcell.interfaces import Array
 
@@ -80,19 +80,47 @@ def rotation_z(angle: float) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+# The next two are a line each with SciPy's Rotation. It takes twenty times as long on one rotation, which supervision
+# asks for in every period; and to import it takes longer than all the rest that a driver's process imports.
+
+
 def rotvec_to_matrix(rotvec: npt.ArrayLike) -> Array:
-    """The (3, 3) rotation matrix of a (3,) rotation vector [rad]."""
-    return np.asarray(Rotation.from_rotvec(np.asarray(rotvec, dtype=np.float64)).as_matrix())
+    """The (..., 3, 3) rotation matrices of (..., 3) rotation vectors [rad], by Rodrigues' formula."""
+    v = np.asarray(rotvec, dtype=np.float64)
+    angle = np.sqrt((v * v).sum(axis=-1))[..., None, None]
+    K = np.zeros((*v.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    K -= np.swapaxes(K, -1, -2)
+    # sin(a) / a and (1 - cos(a)) / a^2, both exact at 0. np.sinc(x) is sin(pi x) / (pi x).
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (K @ K))
 
 
 def matrix_to_rotvec(rotation: Array) -> Array:
-    """The (3,) rotation vector [rad] of a (3, 3) rotation matrix."""
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+    """The (3,) rotation vector [rad] of a (3, 3) rotation matrix.
+
+    Shepperd's method (1978): the quaternion, starting from its largest part.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    trace = a + e + i
+    if trace > max(a, e, i):
+        w, x, y, z = 1 + trace, h - f, c - g, d - b
+    elif a >= e and a >= i:
+        w, x, y, z = h - f, 1 + a - e - i, b + d, c + g
+    elif e >= i:
+        w, x, y, z = c - g, b + d, 1 + e - a - i, f + h
+    else:
+        w, x, y, z = d - b, c + g, f + h, 1 + i - a - e
+    if w < 0:
+        w, x, y, z = -w, -x, -y, -z
+    sine = math.sqrt(x * x + y * y + z * z)
+    if sine == 0:
+        return np.zeros(3)
+    return np.array((x, y, z)) * (2 * math.atan2(sine, w) / sine)
 
 
 def rotation_angle(R_a: Array, R_b: Array) -> float:
     """The angle [rad] of the rotation between two (3, 3) rotation matrices."""
-    return float(np.linalg.norm(matrix_to_rotvec(R_a.T @ R_b)))
+    return math.hypot(*matrix_to_rotvec(R_a.T @ R_b).tolist())
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -106,7 +134,8 @@ def interpolate_transforms(T_start: Array, T_end: Array, fractions: npt.ArrayLik
     s = np.atleast_1d(np.asarray(fractions, dtype=np.float64))
     T = np.tile(np.eye(4), (len(s), 1, 1))
     T[:, :3, 3] = T_start[:3, 3] + s[:, None] * (T_end[:3, 3] - T_start[:3, 3])
-    T[:, :3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([T_start[:3, :3], T_end[:3, :3]])))(s).as_matrix()
+    turn = matrix_to_rotvec(T_start[:3, :3].T @ T_end[:3, :3])
+    T[:, :3, :3] = T_start[:3, :3] @ rotvec_to_matrix(s[:, None] * turn)
     return T
 
 

@@ -15,6 +15,14 @@ from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import controller_ranges, rg2, ur5e
 from robotcell.geometry.transforms import interpolate_transforms, invert_transform, rotation_angle
 from robotcell.interfaces import KICK_TIMEOUT_S, Arm, ArmMode, ArmState
+from sim_twin.devices.arm_limits import (
+    LEAVING_FORCE_N,
+    MAX_TARGET_SPEED_RAD_S,
+    PROTECTIVE_FORCE_N,
+    ROTATION_LEVER_M,
+    STOP_DECELERATION_RAD_S2,
+    TRACKING_ERROR_RAD,
+)
 from sim_twin.devices.trajectory import slow_down, trapezoid
 from sim_twin.world import robot_model
 from sim_twin.world.simulation import STEP_S
@@ -23,22 +31,8 @@ if TYPE_CHECKING:
     from robotcell.interfaces import Array
     from sim_twin.world.world import World
 
-# A stop brakes the tool at 10 m/s^2 (what ur_rtde passes to stopl), here 0.5 m from the joint that turns fastest.
-STOP_DECELERATION_RAD_S2 = 20.0
-# Universal Robots, factory safety preset of the UR5e: force limit.
-PROTECTIVE_FORCE_N = 150.0
-# A joint this far from where it should be could not follow: its motor is at its limit. Assumed.
-TRACKING_ERROR_RAD = 0.05
-# Half more than at the fastest joint speed: a target that leaps further within a period is no path. The real controller
-# stops with "path sanity check failed"; its threshold is not public. Assumed.
-MAX_TARGET_SPEED_RAD_S = 1.5 * ur5e.MAX_JOINT_SPEED
-# A motion that starts pressed against something may press this much more. Assumed.
-LEAVING_FORCE_N = 30.0
-
 # Share of the position error that each joint controller corrects within a step.
 JOINT_GAINS = (0.5,) * 6
-# A rotation counts as the way that the flange goes when it turns about the tcp: no end of the tool outruns the speed.
-ROTATION_LEVER_M = rg2.CLOSED_LENGTH_M
 
 _T_TCP_FLANGE = invert_transform(rg2.T_FLANGE_TCP)
 

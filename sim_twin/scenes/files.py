@@ -7,14 +7,13 @@ workspace and z from the table top.
 from __future__ import annotations
 
 import math
-import sys
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from itertools import cycle, permutations
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -22,15 +21,11 @@ from scipy.spatial.transform import Rotation
 
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import make_transform, rotation_z, rotvec_to_matrix
+from robotcell.io.input_file import SETTINGS_MAX_BYTES, parse_toml, read_text, read_toml
 from robotcell.perception.colors import PALETTE, word_to_rgb
 from sim_twin.scenes.meshes import MESH_SUFFIXES, Mesh, bounds_center, mesh_inertia
 from sim_twin.scenes.scene import Scene, SceneObject
 from sim_twin.scenes.shapes import BLOCK_NAMES, Shape, block, load_shape
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
@@ -59,7 +54,7 @@ def read_scene(path: Path, meshes: Path | None) -> Scene:
     """
     if meshes is not None and not meshes.is_dir():
         raise ConfigError(f"{meshes}: no such folder; --meshes names that of the mesh files")
-    text = _text(path)
+    text = read_text(path, SETTINGS_MAX_BYTES)
     if path.suffix.lower() == ".toml":
         return _read_toml(path, text, meshes)
     return _read_rows(path, text, meshes)
@@ -89,25 +84,6 @@ def mesh_frame(mesh: Mesh) -> Array:
     y = y - (y @ x) * x
     y /= np.linalg.norm(y)
     return np.column_stack([x, y, np.cross(x, y)])
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such scene file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text: {error}") from error
-
-
-def _toml(path: Path, text: str) -> dict[str, Any]:
-    try:
-        table: dict[str, Any] = tomllib.loads(text)
-    except RecursionError:
-        raise ConfigError(f"{path}: not a TOML file: it is nested too deeply") from None
-    except ValueError as error:  # of the syntax, or of an integer of thousands of digits
-        raise ConfigError(f"{path}: not a TOML file: {error}") from None
-    return table
 
 
 class _Strict(BaseModel):
@@ -164,7 +140,7 @@ class _SceneTable(_Strict):
 
 def _read_toml(path: Path, text: str, meshes: Path | None) -> Scene:
     try:
-        table = _SceneTable.model_validate(_toml(path, text))
+        table = _SceneTable.model_validate(parse_toml(text, path))
     except ValidationError as error:
         problems = [_describe(detail["loc"], detail["msg"]) for detail in error.errors()]
         raise ConfigError("\n  ".join([f"{path}: {len(problems)} mistake(s)", *problems])) from None
@@ -355,7 +331,7 @@ def _read_frames(meshes: Path, files: set[str]) -> dict[str, Array]:
     if FRAMES_FILE not in files:
         return {}
     frames = {}
-    for name, table in _toml(path, _text(path)).items():
+    for name, table in read_toml(path).items():
         if name not in files:
             raise ConfigError(f"{path}: there is no mesh {name[:80]!r} beside it")
         try:

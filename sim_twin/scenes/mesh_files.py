@@ -6,6 +6,7 @@ The axes are those of the file. A DAE file says its own unit of length; all othe
 from __future__ import annotations
 
 import io
+import json
 import re
 import warnings
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotcell.errors import ConfigError
+from robotcell.io.input_file import read_bytes
 from sim_twin.scenes.flat_faces import without_folds
 from sim_twin.scenes.meshes import MESH_SUFFIXES, Mesh, hull, join, mesh_volume
 
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 # What a mesh file may hold: cutting a torus of 3600 triangles takes ten seconds.
 MAX_TRIANGLES = 5000
+# Such a mesh takes below 1 MB; pictures for its surface may come with it.
+_MAX_BYTES = 64_000_000
 
 # Share of a surface that may be missing: small cracks, where faces meet in edges that differ, do no harm.
 _MAX_GAP = 0.005
@@ -46,9 +50,6 @@ def load_meshes(path: Path) -> tuple[Mesh, ...]:
     objects = _read(path)
     if not objects:
         raise ConfigError(f"{path}: holds no faces; a closed mesh is needed")
-    count = sum(len(found.faces) for found in objects)
-    if count > MAX_TRIANGLES:
-        raise ConfigError(f"{path}: {count} triangles; simplify the mesh to at most {MAX_TRIANGLES}")
     if not all(np.isfinite(found.vertices).all() for found in objects):
         raise ConfigError(f"{path}: a coordinate is not a finite number; export the mesh again")
     with _quiet(path):
@@ -69,12 +70,10 @@ def _read(path: Path) -> list[Trimesh]:
     kind = path.suffix.lower()
     if kind not in MESH_SUFFIXES:
         raise ConfigError(f"{path}: no mesh file by its name; the twin reads {', '.join(MESH_SUFFIXES)}")
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such mesh file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from error
+    data = read_bytes(path, _MAX_BYTES)
+    if kind == ".obj":
+        # A backslash at its end continues a line.
+        data = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     if kind == ".obj" and _RELATIVE.search(data):
         raise ConfigError(
             f"{path}: its faces count back from vertices among others; write all vertices before the faces"
@@ -86,7 +85,10 @@ def _read(path: Path) -> list[Trimesh]:
             {"split_objects": True, "group_material": False, "skip_materials": True} if kind == ".obj" else {}
         )
         data = data.removeprefix(b"\xef\xbb\xbf")
+        if kind == ".glb":
+            _check_accessors(data)
         scene: Any = trimesh.load_scene(io.BytesIO(data), file_type=kind[1:], process=False, **options)
+        _check_count(scene, path)
         if scene.units is not None:
             scene = scene.convert_units("meters")
         found = [item for item in scene.dump() if isinstance(item, trimesh.Trimesh) and len(item.faces)]
@@ -98,6 +100,22 @@ def _read(path: Path) -> list[Trimesh]:
                 item.merge_vertices(merge_tex=True, merge_norm=True)
         # trimesh takes the objects of an OBJ file from its end.
         return found[::-1] if kind == ".obj" else found
+
+
+def _check_accessors(data: bytes) -> None:
+    """Refuse a GLB file that asks for arrays which it does not hold: they would be made, as zeros, of any size."""
+    length = int.from_bytes(data[12:16], "little")
+    for accessor in json.loads(data[20 : 20 + length]).get("accessors", ()):
+        if accessor["count"] > len(data):
+            raise ValueError(f"an array of {accessor['count']} entries in a file of {len(data)} bytes")
+
+
+def _check_count(scene: Any, path: Path) -> None:
+    """Refuse too many triangles before objects that are used many times are copied as often."""
+    used = (scene.geometry[scene.graph[node][1]] for node in scene.graph.nodes_geometry)
+    count = sum(len(found.faces) for found in used if hasattr(found, "faces"))
+    if count > MAX_TRIANGLES:
+        raise ConfigError(f"{path}: {count} triangles; simplify the mesh to at most {MAX_TRIANGLES}")
 
 
 def _mesh(found: Trimesh) -> Mesh:

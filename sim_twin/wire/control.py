@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-import select
+import selectors
 import socket
 import threading
-from typing import TYPE_CHECKING, Any
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -28,6 +30,7 @@ _FAULT = TypeAdapter(Fault)
 _LONGEST_LINE = 10_000
 _POLL_S = 0.1
 _SEND_S = 1.0
+_MOST_CLIENTS = 32
 
 
 def handle(line: bytes, cell: ServedCell) -> dict[str, Any]:
@@ -43,6 +46,8 @@ def handle(line: bytes, cell: ServedCell) -> dict[str, Any]:
         return {"ok": False, "error": f"not a fault: {problems}"}
     except CellError as error:
         return {"ok": False, "error": str(error)}
+    except RecursionError:
+        return {"ok": False, "error": f"not a line of JSON that makes sense: nested too deeply; there are {REQUESTS}"}
     except ValueError as error:
         return {"ok": False, "error": f"not a line of JSON: {error}; there are {REQUESTS}"}
 
@@ -107,30 +112,59 @@ class ControlSocket:
         self._listener.close()
 
     def _run(self) -> None:
-        clients: dict[socket.socket, bytearray] = {}
-        while not self._ended.is_set():
-            heard, _, _ = select.select([self._listener, *clients], [], [], _POLL_S)
-            for source in heard:
-                if source is self._listener:
-                    client, _ = self._listener.accept()
-                    client.settimeout(_SEND_S)
-                    clients[client] = bytearray()
-                elif not self._serve(source, clients[source]):
-                    del clients[source]
-                    source.close()
-        for client in clients:
-            client.close()
+        # Takes sockets of any number, unlike select.
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._listener, selectors.EVENT_READ)
+            clients: dict[socket.socket, _Received] = {}
+            while not self._ended.is_set():
+                for key, _ in selector.select(_POLL_S):
+                    source = cast("socket.socket", key.fileobj)
+                    if source is self._listener:
+                        self._welcome(clients, selector)
+                    elif source in clients and not self._serve(source, clients[source]):
+                        _hang_up(source, clients, selector)
+            for client in list(clients):
+                _hang_up(client, clients, selector)
 
-    def _serve(self, client: socket.socket, received: bytearray) -> bool:
+    def _welcome(self, clients: dict[socket.socket, _Received], selector: selectors.BaseSelector) -> None:
+        """Take a client in; where there are too many, the one that has been silent for longest has to go."""
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return
+        if len(clients) >= _MOST_CLIENTS:
+            _hang_up(min(clients, key=lambda one: clients[one].at), clients, selector)
+        client.settimeout(_SEND_S)
+        clients[client] = _Received(time.monotonic())
+        selector.register(client, selectors.EVENT_READ)
+
+    def _serve(self, client: socket.socket, received: _Received) -> bool:
         """Answer what came; whether the client stays."""
         try:
             data = client.recv(4096)
-            received += data
-            while b"\n" in received:
-                end = received.index(b"\n")
-                answer = handle(bytes(received[:end]), self._cell)
-                del received[: end + 1]
-                client.sendall(json.dumps(answer).encode() + b"\n")
+            received.at = time.monotonic()
+            received.data += data
+            while b"\n" in received.data:
+                line, _, received.data = received.data.partition(b"\n")
+                client.sendall(json.dumps(handle(line, self._cell)).encode() + b"\n")
         except OSError:
             return False
-        return bool(data) and len(received) < _LONGEST_LINE
+        return bool(data) and len(received.data) < _LONGEST_LINE
+
+
+@dataclass
+class _Received:
+    """What has come from a client and was not answered yet.
+
+    Attributes:
+        at: when it last said something, or came.
+    """
+
+    at: float
+    data: bytes = b""
+
+
+def _hang_up(client: socket.socket, clients: dict[socket.socket, _Received], selector: selectors.BaseSelector) -> None:
+    selector.unregister(client)
+    del clients[client]
+    client.close()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from calibration.solve.readers.json_file import validate
+from calibration.solve.readers.validation import validate
 from calibration.solve.se3 import nearest_rotation
 from calibration.solve.views import Corners, Views
 from robotcell.config.calibration_file import CameraModel, CharucoBoard, Mount, PointBoard

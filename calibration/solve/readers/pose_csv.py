@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.solve.time_series import Series
 from robotcell.errors import ConfigError
+from robotcell.io.input_file import MEASUREMENTS_MAX_BYTES, read_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,16 +28,10 @@ def read_series(path: Path) -> Series:
     Raises:
         ConfigError: naming the file, the line and what is wrong.
     """
+    lines = read_text(path, MEASUREMENTS_MAX_BYTES).splitlines()
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [
-                (number, row) for number, row in enumerate(csv.reader(file), 1) if any(cell.strip() for cell in row)
-            ]
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+        rows = [(number, row) for number, row in enumerate(csv.reader(lines), 1) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
         raise ConfigError(f"{path}: not a CSV file: {error}") from error
     order = list(range(len(_COLUMNS)))
     if rows and not _is_number(rows[0][1][0]):

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from calibration.solve.readers.corner_record import CornerRecord, parse_board, parse_pose, views_of_corners
-from calibration.solve.readers.json_file import read_json, validate
+from calibration.solve.readers.validation import validate
 from calibration.solve.views import Views
 from robotcell.config.calibration_file import CameraModel, Mount
 from robotcell.errors import ConfigError
+from robotcell.io.input_file import MEASUREMENTS_MAX_BYTES, read_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +35,7 @@ def read_file(path: Path, mount: Mount | None = None) -> Views:
     Raises:
         ConfigError: the file cannot be read or is wrong somewhere.
     """
-    values = read_json(path)
+    values = read_json(path, MEASUREMENTS_MAX_BYTES)
     date = datetime.fromtimestamp(path.stat().st_mtime, timezone.utc)
     if isinstance(values, list):
         return _pairs(values, path, mount or "fixed", date)

@@ -6,21 +6,31 @@ import contextlib
 import queue
 import socket
 import threading
+import time
 
 from robotcell.errors import ConnectionLost
 from sim_twin.wire.d415.stream import Request, read_message
 
-_REQUEST_TIMEOUT_S = 2.0
+_REQUEST_S = 2.0
+# A megapixel frame takes 0.5 s through 100 Mbit/s.
+_FRAME_S = 10.0
 
 
 class Client:
-    """One client. It gets what fits through its connection; what comes while it is still busy is dropped."""
+    """One client. It gets what fits through its connection; what comes while it is still busy is dropped.
 
-    def __init__(self, connection: socket.socket) -> None:
+    Args:
+        connection: of the client.
+        request_s: how long it may take to say what it wants to see.
+        frame_s: how long it may take to read a frame.
+    """
+
+    def __init__(self, connection: socket.socket, request_s: float = _REQUEST_S, frame_s: float = _FRAME_S) -> None:
         self.request: Request | None = None
         self.described = False
         self.gone = False
         self._connection = connection
+        self._request_s, self._frame_s = request_s, frame_s
         self._outbox: queue.Queue[bytes | None] = queue.Queue(maxsize=1)
         self._thread = threading.Thread(target=self._serve, name="camera client", daemon=True)
         self._thread.start()
@@ -46,12 +56,11 @@ class Client:
     def _serve(self) -> None:
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._connection.settimeout(_REQUEST_TIMEOUT_S)
-            with self._connection.makefile("rb") as stream:
-                message = read_message(stream)
+            message = read_message(_InTime(self._connection, self._request_s))
             if not isinstance(message, Request):
                 return
-            self._connection.settimeout(None)
+            # Of a whole message, however it is cut.
+            self._connection.settimeout(self._frame_s)
             self.request = message
             while (waiting := self._outbox.get()) is not None:
                 self._connection.sendall(waiting)
@@ -59,3 +68,19 @@ class Client:
             pass  # the client left, or is none
         finally:
             self.gone = True
+
+
+class _InTime:
+    """Reads a connection until a time, however little comes at once."""
+
+    def __init__(self, connection: socket.socket, within_s: float) -> None:
+        self._connection = connection
+        self._deadline = time.monotonic() + within_s
+
+    def readinto(self, buffer: memoryview, /) -> int:
+        """Fill a buffer as far as possible; 0 at the end."""
+        left_s = self._deadline - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("the client does not say what it wants")
+        self._connection.settimeout(left_s)
+        return self._connection.recv_into(buffer)

@@ -158,7 +158,7 @@ class CameraServer:
 
     def _accept(self) -> None:
         if self._listener is not None:
-            with contextlib.suppress(BlockingIOError, ConnectionAbortedError):
+            with contextlib.suppress(OSError):  # it has gone again, or there are no descriptors left
                 connection = self._listener.accept()[0]
                 if len(self._clients) < _MOST_CLIENTS:
                     self._clients.append(Client(connection))

@@ -98,6 +98,8 @@ class Rg2:
         self._targets = {_FORCE: 0, _WIDTH: 0}
         self._offset = 0
         self._count = 0
+        # Whether the last command was a stop: whatever the world still reports, no grip is under way then.
+        self._stopped = True
         # The depth when the last motion began; None before the first.
         self._start_depth: int | None = None
         self._no_power_until = 0.0
@@ -171,7 +173,9 @@ class Rg2:
 
     def _grip(self, *, with_offset: bool) -> None:
         """Start a motion, unless the gripper is moving or must not move."""
-        if self._tripped or self._safety_error or self._measure()[_STATUS] & _BUSY:
+        if self._tripped or self._safety_error or "busy" in self._wrong:
+            return
+        if not self._stopped and self._measure()[_STATUS] & _BUSY:
             return
         width = self._targets[_WIDTH] + (2 * self._offset if with_offset else 0)
         self._start_depth = self._measure()[_DEPTH]
@@ -182,6 +186,7 @@ class Rg2:
 
     def _send(self, *, stop: bool = False, width_m: float = 0.0, force_n: float = 0.0) -> None:
         self._count += 1
+        self._stopped = stop
         self._command.write(count=self._count, stop=stop, width_m=width_m, force_n=force_n)
 
     def _powered(self) -> bool:

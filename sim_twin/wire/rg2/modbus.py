@@ -9,13 +9,20 @@ from __future__ import annotations
 import asyncio
 import enum
 import random
+import socket
 import struct
+import time
 from typing import TYPE_CHECKING, Protocol, cast
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 _HEADER = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
+# Decided here; the real box may keep a silent client for ever.
+_FIRST_REQUEST_S, _NEXT_REQUEST_S = 1.0, 60.0
+# Of a client that does not read, so many bytes wait in the kernel, and so many responses for their time.
+_SEND_BUFFER = 16 * 1024
+_MOST_LATE_RESPONSES = 1000
 _MAX_READ, _MAX_WRITE, _MAX_READ_WRITE = 125, 123, 121
 
 
@@ -139,10 +146,14 @@ def _unpack(layout: str, data: bytes) -> tuple[int, ...]:
 class ModbusServer:
     """Serves units to one client at a time; further ones are let in and hung up on.
 
+    A client that has been silent for longer than it may makes room for the next one.
+
     Args:
         units: that answer.
         host: address on which it listens.
         port: there; 0 for any.
+        first_request_s: how long a client keeps its place without having asked for anything.
+        next_request_s: how long after its last request.
 
     Attributes:
         silent: requests are taken and not answered.
@@ -151,8 +162,17 @@ class ModbusServer:
         delay_s: answers come this much late.
     """
 
-    def __init__(self, units: Units, host: str, port: int) -> None:
+    def __init__(
+        self,
+        units: Units,
+        host: str,
+        port: int,
+        first_request_s: float = _FIRST_REQUEST_S,
+        next_request_s: float = _NEXT_REQUEST_S,
+    ) -> None:
         self._units = units
+        self.first_request_s = first_request_s
+        self.next_request_s = next_request_s
         self._host = host
         self.port = port
         self._server: asyncio.Server | None = None
@@ -190,6 +210,8 @@ class ModbusServer:
 
     def let_in(self, client: _Client) -> bool:
         """Whether this is the one client."""
+        if self._client is not None and self._client.silent:
+            self.hang_up()
         if self._client is None or self._client.closing:
             self._client = client
         return self._client is client
@@ -215,11 +237,22 @@ class _Client(asyncio.Protocol):
         self._server = server
         self._transport: asyncio.Transport | None = None
         self._received = bytearray()
+        # When it last sent a whole request, and what it may take until the next one; at first, when it came.
+        self._heard_at = time.monotonic()
+        self._may_be_silent_s = server.first_request_s
+        # Responses that wait for their time, and whether those that were sent are being read.
+        self._late = 0
+        self._reads = True
 
     @property
     def closing(self) -> bool:
         """Whether the connection is, or is about to be, closed."""
         return self._transport is None or self._transport.is_closing()
+
+    @property
+    def silent(self) -> bool:
+        """Whether it has asked for nothing for so long that it must make room."""
+        return time.monotonic() - self._heard_at > self._may_be_silent_s
 
     def close(self) -> None:
         """Hang up."""
@@ -229,12 +262,23 @@ class _Client(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Take the connection, or hang up on a second one."""
         self._transport = cast("asyncio.Transport", transport)
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         if not self._server.let_in(self):
             self.close()
 
     def connection_lost(self, _error: Exception | None) -> None:
         """Forget it."""
         self._transport = None
+
+    def pause_writing(self) -> None:
+        """Take no more requests from a client that does not read the responses."""
+        self._reads = False
+        self._take_turns()
+
+    def resume_writing(self) -> None:
+        """Go on when it reads them."""
+        self._reads = True
+        self._take_turns()
 
     def data_received(self, data: bytes) -> None:
         """Answer what is whole."""
@@ -245,10 +289,24 @@ class _Client(asyncio.Protocol):
             self.close()
             return
         for frame in frames:
+            self._heard_at, self._may_be_silent_s = time.monotonic(), self._server.next_request_s
             response = self._server.respond(frame)
             if response is not None:
+                self._late += 1
                 asyncio.get_running_loop().call_later(self._server.delay_s, self._send, response)
+        self._take_turns()
 
     def _send(self, response: bytes) -> None:
-        if self._transport is not None and not self._transport.is_closing():
+        self._late -= 1
+        if not self.closing and self._transport is not None:
             self._transport.write(response)
+        self._take_turns()
+
+    def _take_turns(self) -> None:
+        """Listen to the client only as long as it reads, and not too many responses wait."""
+        if self._transport is None or self._transport.is_closing():
+            return
+        if self._reads and self._late < _MOST_LATE_RESPONSES:
+            self._transport.resume_reading()
+        else:
+            self._transport.pause_reading()

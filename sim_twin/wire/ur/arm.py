@@ -8,10 +8,10 @@ import numpy as np
 from ur_analytic_ik import ur5e as analytic_ik
 
 from robotcell.geometry import ur5e
-from robotcell.geometry.transforms import invert_transform
-from sim_twin.devices.arm import MAX_TARGET_SPEED_RAD_S, STOP_DECELERATION_RAD_S2
+from robotcell.geometry.transforms import invert_transform, matrix_to_rotvec
+from sim_twin.devices.arm_limits import MAX_TARGET_SPEED_RAD_S, STOP_DECELERATION_RAD_S2
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.pose import ZERO_POSE, Pose, displaced, matrix_to_pose, pose_to_matrix, rotation_vector
+from sim_twin.wire.ur.pose import ZERO_POSE, Pose, displaced, matrix_to_pose, pose_to_matrix
 from sim_twin.wire.ur.program import ScriptError
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Arm:
             return np.zeros(6)
         h = 1e-6
         T, T_next = self.forward(q), self.forward(q + h * qd)
-        w = rotation_vector(T_next[:3, :3] @ T[:3, :3].T)
+        w = matrix_to_rotvec(T_next[:3, :3] @ T[:3, :3].T)
         return np.concatenate([T_next[:3, 3] - T[:3, 3], w]) / h
 
     def measure(self, q: Array, qd: Array, wrench: Array) -> None:

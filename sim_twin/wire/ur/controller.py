@@ -13,19 +13,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_twin.devices.arm import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
+from sim_twin.devices.arm_limits import LEAVING_FORCE_N, PROTECTIVE_FORCE_N, TRACKING_ERROR_RAD
 from sim_twin.wire.shared_state import PERIOD_S
 from sim_twin.wire.ur.arm import Arm
 from sim_twin.wire.ur.history import History
 from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.program import ScriptError
 from sim_twin.wire.ur.registers import Outputs, Payload, Registers
+from sim_twin.wire.ur.reports import ErrorCode, ProgramEvent, RuntimeException, SafetyChange, Text
 
 if TYPE_CHECKING:
     from collections.abc import Container, Sequence
 
     from robotcell.geometry.transforms import Array
     from sim_twin.wire.ur.program import Program
+    from sim_twin.wire.ur.reports import Report
 
 VERSION = (5, 12, 0, 1101319)
 SERIAL_NUMBER = "20225500001"
@@ -42,6 +44,10 @@ _RATE_SLOPE = 6.0
 _TRACKING_PERIODS = 20
 # When the world has not stepped for so long, the time of motions stands still too; the arm could not follow them.
 _WORLD_STALLS_S = 0.015
+# Universal Robots, service manual, error codes: C153 "position deviates from path", whose argument is the joint from 0,
+# and C157 "collision detected by joint"; -1 stands for no argument.
+_DEVIATES_FROM_PATH, _COLLISION = 153, 157
+_NO_ARGUMENT = -1
 
 
 @dataclass
@@ -63,10 +69,10 @@ class Controller:
     Attributes:
         time: seconds since the controller started.
         execution_time: how long the whole last period took its process [s].
-        notes: (title, text) of what happened, for the clients that read messages; the server takes them out.
+        reports: what happened, for the clients that read messages; the server takes them out.
         remote: whether the pendant is in remote control.
         slider: the speed slider, 0 to 1.
-        loaded: the program file that the pendant has loaded.
+        operational_mode: MANUAL or AUTOMATIC where a client has set it, else NONE.
         program: that runs, or is paused.
         history: what was measured lately.
     """
@@ -81,10 +87,10 @@ class Controller:
         self.time = 0.0
         self.execution_time = 0.0
         self.ticks = 0
-        self.notes: deque[tuple[str, str]] = deque(maxlen=100)
+        self.reports: deque[Report] = deque(maxlen=100)
         self.remote = True
         self.slider = 1.0
-        self.loaded: str | None = None
+        self.operational_mode = "NONE"
         self.program: Program | None = None
         self.watchdog: Watchdog | None = None
         self.robot_mode = RobotMode.RUNNING
@@ -170,7 +176,7 @@ class Controller:
         self.stop_program()
         self.program = program
         self.runtime = RuntimeState.PLAYING
-        self.note("PROGRAM_XXX_STARTED", program.name)
+        self.reports.append(ProgramEvent(program.name, started=True))
         return True
 
     def stop_program(self, reason: str | None = None) -> None:
@@ -179,12 +185,17 @@ class Controller:
             self.note("Program stopped", reason)
         if self.program is None:
             return
-        self.note("PROGRAM_XXX_STOPPED", self.program.name)
+        self.reports.append(ProgramEvent(self.program.name, started=False))
         self.program = None
         self.watchdog = None
         self.arm.freedrive = False
         self.arm.force_mode = None
         self.runtime = RuntimeState.STOPPED
+
+    def fail_program(self, error: ScriptError) -> None:
+        """Say why a program was refused or has died, and end the one that runs."""
+        self.reports.append(RuntimeException(error.line, error.words))
+        self.stop_program(str(error))
 
     def pause_program(self) -> bool:
         """Bring the arm to a standstill on its path and the program with it; whether one runs."""
@@ -207,7 +218,7 @@ class Controller:
 
     def note(self, title: str, text: str) -> None:
         """Tell the clients that read messages."""
-        self.notes.append((title, text))
+        self.reports.append(Text(f"{title}: {text}"))
 
     def set_tcp(self, tcp: Sequence[float]) -> None:
         """Take another tool centre point."""
@@ -243,11 +254,20 @@ class Controller:
             begin = self.time if self._power_at is None else self._power_at
             self._brakes_at = begin + _BRAKE_RELEASE_S
 
-    def protective_stop(self, reason: str) -> None:
-        """Stop at once, for good until it is unlocked; the program is paused."""
+    def protective_stop(self, reason: str, code: int | None = None, argument: int = _NO_ARGUMENT) -> None:
+        """Stop at once, for good until it is unlocked; the program is paused.
+
+        Args:
+            reason: in plain words.
+            code: of the service manual, where it has one.
+            argument: that goes with it.
+        """
         if self.safety_mode is not SafetyMode.NORMAL:
             return
-        self.safety_mode = SafetyMode.PROTECTIVE_STOP
+        cause = None if code is None else ErrorCode(code, argument, reason)
+        if cause is not None:
+            self.reports.append(cause)
+        self._enter(SafetyMode.PROTECTIVE_STOP, cause)
         self._stopped_at = self.time
         self.arm.hold()
         self._halt_program()
@@ -260,7 +280,7 @@ class Controller:
             return True
         if self.time - self._stopped_at < self._unlock_after_s:
             return False
-        self.safety_mode = SafetyMode.NORMAL
+        self._enter(SafetyMode.NORMAL)
         # Somebody may have moved the arm meanwhile.
         self.arm.hold()
         self._targets[:] = self.arm.q
@@ -270,18 +290,18 @@ class Controller:
     def safeguard_stop(self) -> None:
         """Stop on the path as long as the safeguard input is open."""
         if self.safe:
-            self.safety_mode = SafetyMode.SAFEGUARD_STOP
+            self._enter(SafetyMode.SAFEGUARD_STOP)
             self.pause_program()
 
     def emergency_stop(self, mode: SafetyMode = SafetyMode.ROBOT_EMERGENCY_STOP) -> None:
         """Stop, cut the power and end the program. The button is pressed, or a safety limit was violated."""
-        self.safety_mode = mode
+        self._enter(mode)
         self.power_off()
 
     def restart_safety(self) -> None:
         """Leave a violation; the arm is without power then."""
         if self.safety_mode is SafetyMode.VIOLATION:
-            self.safety_mode = SafetyMode.NORMAL
+            self._enter(SafetyMode.NORMAL)
 
     def boot(self) -> None:
         """Be as a controller that has just been switched on."""
@@ -290,9 +310,14 @@ class Controller:
 
     def restore(self) -> None:
         """Be ready again, as after all that an operator does at the pendant."""
-        self.safety_mode = SafetyMode.NORMAL
+        self._enter(SafetyMode.NORMAL)
         self._power_at = self._brakes_at = None
         self.robot_mode = RobotMode.RUNNING
+
+    def _enter(self, mode: SafetyMode, cause: ErrorCode | None = None) -> None:
+        if mode is not self.safety_mode:
+            self.safety_mode = mode
+            self.reports.append(SafetyChange(mode, cause))
 
     def _measure(self, cell: np.void) -> None:
         self.arm.measure(cell["q"], cell["qd"], cell["wrench"])
@@ -309,15 +334,17 @@ class Controller:
         if not self.powered or self.safety_mode is SafetyMode.PROTECTIVE_STOP:
             return
         if self._force_n > self._force_limit_n:
-            self.protective_stop(f"the arm was pushed with {self._force_n:.0f} N")
+            self.protective_stop(f"the arm was pushed with {self._force_n:.0f} N", _COLLISION)
             return
         # The targets of the periods just before the measurement.
         newest = self.ticks - 1 - min(round(age / PERIOD_S), len(self._targets) - _TRACKING_PERIODS - 1)
         window = self._targets[np.arange(newest - _TRACKING_PERIODS, newest + 1) % len(self._targets)]
         q = self.arm.measured_q
-        error = float(np.maximum(window.min(axis=0) - q, q - window.max(axis=0)).max())
-        if error > TRACKING_ERROR_RAD:
-            self.protective_stop(f"a joint is {error:.2f} rad from where it should be")
+        errors = np.maximum(window.min(axis=0) - q, q - window.max(axis=0))
+        joint = int(errors.argmax())
+        if errors[joint] > TRACKING_ERROR_RAD:
+            reason = f"joint {joint + 1} is {errors[joint]:.2f} rad from where it should be"
+            self.protective_stop(reason, _DEVIATES_FROM_PATH, joint)
 
     def _watch_client(self) -> None:
         dog = self.watchdog
@@ -337,7 +364,7 @@ class Controller:
         try:
             running = program.step()
         except ScriptError as error:
-            self.stop_program(str(error))
+            self.fail_program(error)
             return
         if not running:
             self.stop_program()

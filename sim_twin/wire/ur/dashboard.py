@@ -5,6 +5,9 @@ Wording: Universal Robots, "Dashboard Server, e-Series", and what UR's own clien
 
 from __future__ import annotations
 
+import itertools
+import time
+from collections import deque
 from typing import TYPE_CHECKING
 
 from sim_twin.wire.ur.controller import MODEL, SERIAL_NUMBER, VERSION
@@ -37,7 +40,19 @@ _REMOTE_ONLY = frozenset(
         "shutdown",
     }
 )
-_WITH_TEXT = ("load installation", "load", "popup", "addToLog", "set operational mode", "setUserRole")
+_WITH_TEXT = (
+    "load installation",
+    "load",
+    "popup",
+    "addToLog",
+    "set operational mode",
+    "setUserRole",
+    "generate flight report",
+    "generate support file",
+)
+_OPERATIONAL_MODES = frozenset({"MANUAL", "AUTOMATIC"})
+_FLIGHT_REPORTS = frozenset({"", "controller", "software", "system"})
+_report_ids = itertools.count(1)
 
 
 class DashboardSession:
@@ -49,20 +64,23 @@ class DashboardSession:
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self._buffer = b""
+        self._rest = b""
+        self._lines: deque[bytes] = deque()
         self.ended = False
 
-    def feed(self, data: bytes) -> bytes:
-        """Take bytes in, whole lines or not, and return the answers to them."""
-        *lines, self._buffer = (self._buffer + data).split(b"\n")
+    def feed(self, data: bytes) -> None:
+        """Take bytes in, whole lines or not."""
+        *ended, rest = (self._rest + data).split(b"\n")
+        self._lines.extend(ended)
         # A line without an end is never answered; it must not grow for ever.
-        self._buffer = self._buffer[-_MAX_LINE:]
-        answers = []
-        for line in lines:
-            if self.ended:
-                break
-            answers.append(self._answer(line.decode("latin-1").strip()) + "\n")
-        return "".join(answers).encode("latin-1", "replace")
+        self._rest = rest[:_MAX_LINE]
+
+    def step(self) -> bytes | None:
+        """Obey the next whole line; the answer to it, None when there is none."""
+        if not self._lines or self.ended:
+            return None
+        line = self._lines.popleft()[:_MAX_LINE].decode("latin-1").strip()
+        return f"{self._answer(line)}\n".encode("latin-1", "replace")
 
     def _answer(self, line: str) -> str:
         command, text = _split(line)
@@ -109,7 +127,39 @@ def _state(controller: Controller, _: str) -> str:
     word = {RuntimeState.PLAYING: "PLAYING", RuntimeState.PAUSING: "PAUSED", RuntimeState.PAUSED: "PAUSED"}.get(
         controller.runtime, "STOPPED"
     )
-    return f"{word} {controller.program.name if controller.program else 'null'}"
+    return f"{word} {_program(controller)}"
+
+
+def _saved(controller: Controller, _: str) -> str:
+    return f"true {_program(controller)}"
+
+
+def _program(controller: Controller) -> str:
+    return controller.program.name if controller.program else "null"
+
+
+def _set_operational_mode(controller: Controller, text: str) -> str:
+    if text.upper() not in _OPERATIONAL_MODES:
+        return f"Failed setting operational mode: {text}"
+    controller.operational_mode = text.upper()
+    return f"Operational mode {text} is set"
+
+
+def _clear_operational_mode(controller: Controller, _: str) -> str:
+    controller.operational_mode = "NONE"
+    return "No longer controlling the operational mode. Current operational mode: 'NONE'."
+
+
+def _flight_report(_: Controller, text: str) -> str:
+    if text.lower() not in _FLIGHT_REPORTS:
+        return f"Error generating flight report: {text}"
+    return f"Flight Report generated with id: {next(_report_ids)}"
+
+
+def _support_file(_: Controller, text: str) -> str:
+    if not text:
+        return "Error: no directory was given"
+    return f"Completed successfully: ur_{SERIAL_NUMBER}_{time.strftime('%Y-%m-%d_%H-%M-%S')}.zip"
 
 
 def _popup(controller: Controller, text: str) -> str:
@@ -170,7 +220,7 @@ _COMMANDS: dict[str, Callable[[Controller, str], str]] = {
     "running": _running,
     "programState": _state,
     "get loaded program": lambda _, __: "No program loaded",
-    "isProgramSaved": lambda _, __: "true",
+    "isProgramSaved": _saved,
     "popup": _popup,
     "close popup": _close_popup,
     "close safety popup": _close_safety_popup,
@@ -183,11 +233,12 @@ _COMMANDS: dict[str, Callable[[Controller, str], str]] = {
     "get serial number": lambda _, __: SERIAL_NUMBER,
     "get robot model": lambda _, __: MODEL,
     "is in remote control": lambda c, _: "true" if c.remote else "false",
-    "get operational mode": lambda _, __: "NONE",
-    "set operational mode": lambda _, text: f"Setting operational mode: {text}",
-    "clear operational mode": lambda _, __: (
-        "No longer controlling the operational mode. Current operational mode: 'NONE'."
-    ),
+    "get operational mode": lambda c, _: c.operational_mode,
+    "set operational mode": _set_operational_mode,
+    "clear operational mode": _clear_operational_mode,
+    "saveLog": lambda _, __: "Log saved to disk",
+    "generate flight report": _flight_report,
+    "generate support file": _support_file,
     "setUserRole": lambda _, text: f"Setting user role: {text}",
     "getUserRole": lambda _, __: "PROGRAMMER",
     "power on": _power_on,

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotcell.geometry import ur5e
-from sim_twin.devices.arm import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
+from robotcell.geometry.transforms import matrix_to_rotvec
+from sim_twin.devices.arm_limits import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
 from sim_twin.devices.trajectory import Trapezoid
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.pose import displaced, pose_to_matrix, rotation_vector
+from sim_twin.wire.ur.pose import displaced, pose_to_matrix
 from sim_twin.wire.ur.program import ScriptError, Thread
 from sim_twin.wire.ur.stops import stop_joints
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from robotcell.interfaces import Array
     from sim_twin.wire.ur.arm import Arm
 
-_SLOWEST = 1e-5
+# A move that is slower than this [m/s, rad/s and per second] would never end.
+SLOWEST = 1e-5
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class Move:
         acceleration: of the same.
         blend_m: radius around the target where the next move may begin.
         number: of the waypoint, for the progress.
+        line: of its program, for messages; 0 where it is not known.
     """
 
     target: tuple[float, ...]
@@ -45,9 +48,10 @@ class Move:
     acceleration: float
     blend_m: float = 0.0
     number: int = 0
+    line: int = field(default=0, compare=False)
 
 
-def follow(arm: Arm, moves: Sequence[Move], begin: Callable[[int], None] = lambda _: None) -> Thread:
+def follow(arm: Arm, moves: Iterable[Move], begin: Callable[[int], None] = lambda _: None) -> Thread:
     """Move along a path of moves.
 
     Within its blend radius a move overlaps with the next one of its kind: their displacements add up, so the tool stays
@@ -55,22 +59,20 @@ def follow(arm: Arm, moves: Sequence[Move], begin: Callable[[int], None] = lambd
 
     Args:
         arm: that moves.
-        moves: of the path, in order.
+        moves: of the path, in order. A move is taken up when the one before it begins.
         begin: called with each move's number when it begins.
 
     Raises:
         ScriptError: a target, or a pose on the way, cannot be reached.
     """
-    for move in moves:
-        if not (move.speed >= _SLOWEST and move.acceleration >= _SLOWEST):
-            raise ScriptError(f"move: speed and acceleration must be at least {_SLOWEST:g}")
     yield from stop_joints(arm, STOP_DECELERATION_RAD_S2)
-    waiting = list(moves)
+    waiting = iter(moves)
+    upcoming = next(waiting, None)
     active: list[_JointLeg | _LineLeg] = []
     q_end = arm.q
-    while waiting or active:
-        if waiting and (not active or (len(active) == 1 and active[0].may_blend(arm, waiting[0]))):
-            move = waiting.pop(0)
+    while upcoming is not None or active:
+        if upcoming is not None and (not active or (len(active) == 1 and active[0].may_blend(arm, upcoming))):
+            move, upcoming = upcoming, next(waiting, None)
             # The blend ends by half way, so that a move has come to its own line before the next one begins.
             leg = _leg(arm, move, q_end)
             q_end = arm.waypoint = leg.q_goal
@@ -78,13 +80,16 @@ def follow(arm: Arm, moves: Sequence[Move], begin: Callable[[int], None] = lambd
             if leg.duration > 0:
                 active.append(leg)
         if not active:
+            # A move that leads nowhere takes a period, so that a thousand of them cannot hold one up.
+            arm.rest()
+            yield
             continue
         for leg in active:
             leg.t = min(leg.t + arm.rate * PERIOD_S, leg.duration)
         arm.command(active[0].q_now(arm, active[1:]))
         if active[0].t >= active[0].duration:
             active.pop(0)
-        if not active and not waiting:
+        if not active and upcoming is None:
             while not arm.arrives:
                 arm.rest()
                 yield
@@ -138,7 +143,7 @@ class _LineLeg:
         self.t = 0.0
         self._T_start, self._T_goal = arm.forward(q_start), T_goal
         self.way = T_goal[:3, 3] - self._T_start[:3, 3]
-        self.turn = np.array(rotation_vector(T_goal[:3, :3] @ self._T_start[:3, :3].T))
+        self.turn = matrix_to_rotvec(T_goal[:3, :3] @ self._T_start[:3, :3].T)
         self._blend_m = move.blend_m
         length, turn = float(np.linalg.norm(self.way)), float(np.linalg.norm(self.turn))
         distance = max(length, turn * ROTATION_LEVER_M)
@@ -170,6 +175,15 @@ class _LineLeg:
 
 
 def _leg(arm: Arm, move: Move, q_start: Array) -> _JointLeg | _LineLeg:
+    try:
+        return _leg_of(arm, move, q_start)
+    except ScriptError as error:
+        raise ScriptError(str(error), move.line) from None
+
+
+def _leg_of(arm: Arm, move: Move, q_start: Array) -> _JointLeg | _LineLeg:
+    if not (move.speed >= SLOWEST and move.acceleration >= SLOWEST):
+        raise ScriptError(f"move: speed and acceleration must be at least {SLOWEST:g}")
     if move.is_pose:
         T_goal = pose_to_matrix(move.target)
         q_goal = arm.inverse(T_goal, q_start)

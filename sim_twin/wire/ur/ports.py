@@ -14,16 +14,24 @@ _SEND_BUFFER = 64 * 1024
 # Answers are never dropped; a client that asks and asks and never reads is closed instead.
 _MAX_WAITING_ANSWERS = 1000
 _MAX_CLIENTS = 32
-# So little at a time that a client that floods its connection cannot hold up the period.
+# So little at a time that a client that floods its connection cannot hold up the period; the rest waits in the kernel.
 _READ_SIZE = 4096
 
 
 class Session(Protocol):
     """One connection's protocol."""
 
-    def feed(self, data: bytes) -> bytes:
-        """Take bytes in and return the answers."""
+    def feed(self, data: bytes) -> None:
+        """Take bytes in, whole messages or not."""
         ...
+
+    def step(self) -> bytes | None:
+        """Obey the next whole message; the answer to it, or None when there is none."""
+        ...
+
+
+class UnreadAnswersError(Exception):
+    """A client asks and asks, and never reads an answer."""
 
 
 class Outbox:
@@ -52,11 +60,17 @@ class Outbox:
         """Send these bytes, all or, where `droppable`, perhaps none of them."""
         self._waiting.append((now + self.delay_s, data, droppable))
 
+    def clear(self) -> None:
+        """Send nothing of what waits."""
+        self._partial = b""
+        self._waiting.clear()
+
     def flush(self, connection: socket.socket, now: float) -> None:
         """Hand over what is due, as far as the client takes it.
 
         Raises:
-            OSError: the connection is lost, or the client never reads what it asks for.
+            OSError: the connection is lost.
+            UnreadAnswersError: the client never reads what it asks for.
         """
         while self._partial or (self._waiting and self._waiting[0][0] <= now):
             data = self._partial or self._waiting.popleft()[1]
@@ -82,7 +96,7 @@ class Outbox:
                 kept.append(item)
             self._waiting = deque(kept)
         if len(due) - packages > _MAX_WAITING_ANSWERS:
-            raise ConnectionAbortedError("the client does not read its answers")
+            raise UnreadAnswersError
 
 
 class Client:
@@ -91,23 +105,59 @@ class Client:
     Args:
         connection: of the client; becomes non-blocking.
         session: of its protocol.
+        now: time.monotonic() [s].
+
+    Attributes:
+        outbox: what is on its way to it.
+        heard_at: when it last sent something; until then, when it came.
+        has_spoken: whether it ever sent anything.
+        sends: nothing more comes from a client that has closed its side.
     """
 
-    def __init__(self, connection: socket.socket, session: Session) -> None:
+    def __init__(self, connection: socket.socket, session: Session, now: float) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         self.connection = connection
         self.session = session
         self.outbox = Outbox()
+        self.heard_at = now
+        self.has_spoken = False
+        self.sends = True
+        # What it sent before it closed is obeyed even where nothing can be sent to it any longer.
+        self._takes = True
 
-    def read(self) -> bytes:
-        """What has come; empty when the client has closed.
+    def read(self, now: float) -> bool:
+        """Hand what has come to the session; whether anything has."""
+        try:
+            data = self.connection.recv(_READ_SIZE)
+        except BlockingIOError:
+            return False
+        except OSError:
+            data = b""
+        if not data:
+            self.sends = False
+            return False
+        self.heard_at, self.has_spoken = now, True
+        self.session.feed(data)
+        return True
+
+    def send(self, data: bytes, now: float, *, droppable: bool) -> None:
+        """Send these bytes, all or, where `droppable`, perhaps none of them."""
+        if self._takes:
+            self.outbox.put(data, now, droppable=droppable)
+
+    def flush(self, now: float) -> None:
+        """Hand over what is due, as far as the client takes it.
 
         Raises:
-            OSError: the connection is lost.
+            UnreadAnswersError: the client never reads what it asks for.
         """
-        return self.connection.recv(_READ_SIZE)
+        try:
+            self.outbox.flush(self.connection, now)
+        except OSError:
+            self._takes = False
+            self.outbox.clear()
 
     def close(self) -> None:
         """End the connection. Idempotent."""
@@ -154,17 +204,19 @@ class Port:
         self.listener = listener
 
     def accept(self) -> socket.socket | None:
-        """A client that has called, None if it has gone again or is one too many."""
+        """A client that has called, None if it has gone again."""
         if self.listener is None:
             return None
         try:
             connection, _ = self.listener.accept()
         except OSError:
             return None
-        if len(self.clients) >= _MAX_CLIENTS:
-            connection.close()
-            return None
         return connection
+
+    @property
+    def full(self) -> bool:
+        """Whether it has all the clients that it can have."""
+        return len(self.clients) >= _MAX_CLIENTS
 
     def close(self) -> None:
         """Stop listening. Idempotent; the clients stay."""

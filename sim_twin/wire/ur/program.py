@@ -12,7 +12,18 @@ _LARGEST = 1e6
 
 
 class ScriptError(Exception):
-    """A program does what the controller refuses; it dies with this message."""
+    """A program does what the controller refuses; it dies with this message.
+
+    Args:
+        message: what the twin says of it.
+        line: of the program, from 1; 0 where no line is to blame.
+        words: what the controller says of it; the message, unless given.
+    """
+
+    def __init__(self, message: str, line: int = 0, words: str | None = None) -> None:
+        super().__init__(f"line {line}: {message}" if line else message)
+        self.line = line
+        self.words = message if words is None else words
 
 
 def checked(number: float) -> float:

@@ -1,4 +1,4 @@
-"""RTDE as the server speaks it: one connection's protocol, bytes in and bytes out.
+"""RTDE as the server speaks it: one connection's protocol, bytes in and answers out.
 
 Universal Robots, "Real-Time Data Exchange guide": every message is a size (with this header), a type and a payload, big
 endian. Both protocol versions are spoken; a connection begins in version 1.
@@ -55,7 +55,7 @@ class RtdeSession:
         self._controller = controller
         self._claims = claims
         self._wrong = wrong
-        self._buffer = b""
+        self._buffer = bytearray()
         self._version = 1
         self._outputs: Recipe | None = None
         self._outputs_refused = False
@@ -63,23 +63,26 @@ class RtdeSession:
         self._inputs: dict[int, Recipe] = {}
         self.streaming = False
 
-    def feed(self, data: bytes) -> bytes:
-        """Take bytes in, whole messages or not, and return the answers to them.
+    def feed(self, data: bytes) -> None:
+        """Take bytes in, whole messages or not."""
+        self._buffer += data
+
+    def step(self) -> bytes | None:
+        """Obey the next whole message; the answer to it, None when there is none.
 
         Raises:
             ProtocolError: a message is shorter than its own header.
         """
-        self._buffer += data
-        answers: list[bytes] = []
-        while len(self._buffer) >= _HEADER.size:
-            size, kind = _HEADER.unpack_from(self._buffer)
-            if size < _HEADER.size:
-                raise ProtocolError(f"a message of {size} bytes")
-            if len(self._buffer) < size:
-                break
-            payload, self._buffer = self._buffer[_HEADER.size : size], self._buffer[size:]
-            answers.append(self._answer(kind, payload))
-        return b"".join(answers)
+        if len(self._buffer) < _HEADER.size:
+            return None
+        size, kind = _HEADER.unpack_from(self._buffer)
+        if size < _HEADER.size:
+            raise ProtocolError(f"a message of {size} bytes")
+        if len(self._buffer) < size:
+            return None
+        payload = bytes(self._buffer[_HEADER.size : size])
+        del self._buffer[:size]
+        return self._answer(kind, payload)
 
     def package(self, snapshot: Snapshot, tick: int) -> bytes | None:
         """The data package of a control period, None where this client gets none."""

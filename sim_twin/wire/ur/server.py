@@ -13,6 +13,7 @@ import os
 import select
 import signal
 import time
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,17 +22,15 @@ import numpy as np
 from robotcell.errors import ConfigError
 from sim_twin.wire.faults import FaultInbox, Kind
 from sim_twin.wire.shared_state import ARM_COMMAND, CELL_STATE, PERIOD_S, Record
-from sim_twin.wire.ur.control_loop import ControlLoop
 from sim_twin.wire.ur.controller import Controller
 from sim_twin.wire.ur.dashboard import GREETING, DashboardSession
-from sim_twin.wire.ur.ports import Client, Port, Session
-from sim_twin.wire.ur.program import Program, ScriptError
+from sim_twin.wire.ur.launch import launch
+from sim_twin.wire.ur.ports import Client, Port, Session, UnreadAnswersError
 from sim_twin.wire.ur.rtde import ProtocolError, RtdeSession
-from sim_twin.wire.ur.script import Script, ScriptReader
+from sim_twin.wire.ur.script_reader import ScriptReader
 from sim_twin.wire.ur.snapshot import Snapshot
 from sim_twin.wire.ur.state_faults import STATE_FAULTS, StateFaults
-from sim_twin.wire.ur.statements import run_at_once, run_statements
-from sim_twin.wire.ur.streams import STATE_PERIOD_S, note_message, realtime_packet, robot_state, version_message
+from sim_twin.wire.ur.streams import STATE_PERIOD_S, realtime_packet, report_message, robot_state, version_message
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -61,6 +60,12 @@ ARM_FAULTS: frozenset[tuple[str, Kind, str]] = frozenset(
 
 # Held up for longer than this, the controller leaves the missed periods out instead of making up for them.
 _MAX_LAG_S = 0.02
+# Of a period, at most so much is spent on what clients have sent; the system takes the processor away from a process of
+# real-time priority that leaves less than 5 % of it.
+_SHARE = 0.25
+# Carried out in a period even where there is no time left, so that a controller that is late does not grow deaf.
+_LEAST_STEPS = 20
+_REPORTS_PER_PERIOD = 8
 _STATE_TICKS = round(STATE_PERIOD_S / PERIOD_S)
 # A header that says less than its own length; a data package without data; a line that is no word of the dashboard.
 _BAD_HEADER = b"\x00\x01\xff\xff\x00\x00"
@@ -118,20 +123,26 @@ class _ScriptSession:
         self._controller = controller
         self._reader = ScriptReader()
 
-    def feed(self, data: bytes) -> bytes:
-        try:
-            for script in self._reader.feed(data):
-                _launch(self._controller, script)
-        except ScriptError as error:
-            self._controller.stop_program(str(error))
+    def feed(self, data: bytes) -> None:
+        self._reader.feed(data)
+
+    def step(self) -> bytes | None:
+        if not self._reader.waiting:
+            return None
+        received = self._reader.read_line()
+        if received is not None:
+            launch(self._controller, received)
         return b""
 
 
 class _ReadOnlySession:
     """One connection of a port that only sends."""
 
-    def feed(self, data: bytes) -> bytes:
-        return b""
+    def feed(self, data: bytes) -> None:
+        pass
+
+    def step(self) -> bytes | None:
+        return None
 
 
 class _Server:
@@ -143,6 +154,8 @@ class _Server:
         self._connection = faults
         self._inbox = FaultInbox(faults, "arm")
         self._state_faults = StateFaults(self._controller)
+        # Clients from whom something has come that was not looked at yet, in the order of their turns.
+        self._waiting: dict[Client, Port] = {}
         # The faults of now, by channel, kind and what.
         self._present: frozenset[tuple[str, Kind, str]] = frozenset()
         self._claims: dict[str, RtdeSession] = {}
@@ -212,13 +225,17 @@ class _Server:
         """Serve the sockets until a time, at least once."""
         for port in (self._rtde, self._dashboard, self._script):
             self._follow_fault(port)
+        until, least = time.monotonic() + _SHARE * PERIOD_S, _LEAST_STEPS
         while True:
+            self._obey(until, least)
+            least = 0
             readers: dict[Any, tuple[Port, Client | None]] = {}
             for port in self._ports:
                 if port.listener is not None:
                     readers[port.listener] = (port, None)
                 if not self._stuck(port):
-                    readers.update({client.connection: (port, client) for client in port.clients})
+                    listened = [client for client in port.clients if client.sends and client not in self._waiting]
+                    readers.update({client.connection: (port, client) for client in listened})
             timeout = max(0.0, deadline - time.monotonic())
             ready, _, _ = select.select([self._connection, *readers], [], [], timeout)
             for reader in ready:
@@ -230,17 +247,53 @@ class _Server:
                     self._welcome(port)
                 elif client in port.clients:
                     self._read(port, client)
-            if not ready or time.monotonic() >= deadline:
+            if time.monotonic() >= deadline or not ready:
                 return
+
+    def _obey(self, until: float, least: int) -> None:
+        """Carry out what clients have sent, each client a message in turn, until a time, but at least so many.
+
+        However much a client sends, and however long it takes to read, the period is kept, and the processor is left to
+        others for a part of it.
+        """
+        done = 0
+        turns = deque(item for item in self._waiting.items() if not self._stuck(item[1]))
+        while turns:
+            if done >= least and time.monotonic() >= until:
+                return
+            done += 1
+            client, port = turns.popleft()
+            if client in self._waiting and self._step(port, client):
+                turns.append((client, port))
+
+    def _step(self, port: Port, client: Client) -> bool:
+        """Obey one message of a client, if there is a whole one; whether there was."""
+        try:
+            answer = client.session.step()
+        except ProtocolError:
+            self._drop(port, client)
+            return False
+        if answer is not None:
+            self._put(port, client, answer)
+            return True
+        self._waiting.pop(client, None)
+        self._flush(port, client)
+        if not client.sends:
+            self._drop(port, client)
+        return False
 
     def _welcome(self, port: Port) -> None:
         connection = port.accept()
         if connection is None:
             return
+        now = time.monotonic()
         try:
-            client = Client(connection, self._session(port))
+            client = Client(connection, self._session(port), now)
         except OSError:
             connection.close()
+            return
+        if port.full and not self._make_room(port):
+            client.close()
             return
         client.outbox.delay_s = self._delay_s(port)
         port.clients.append(client)
@@ -248,6 +301,14 @@ class _Server:
             self._put(port, client, GREETING)
         elif port in (*self._primary, *self._secondary):
             self._put(port, client, version_message())
+
+    def _make_room(self, port: Port) -> bool:
+        """Hang up on the client that has been silent for longest, first of all on those that never said anything."""
+        silent = [client for client in port.clients if not _streams(client)]
+        if not silent:
+            return False
+        self._drop(port, min(silent, key=lambda client: (client.has_spoken, client.heard_at)))
+        return True
 
     def _session(self, port: Port) -> Session:
         if port is self._rtde:
@@ -257,16 +318,12 @@ class _Server:
         return _ReadOnlySession() if "read-only" in port.name else _ScriptSession(self._controller)
 
     def _read(self, port: Port, client: Client) -> None:
-        try:
-            data = client.read()
-            if not data:
-                self._drop(port, client)
-                return
-            answer = client.session.feed(data)
-            if answer:
-                self._put(port, client, answer)
-            client.outbox.flush(client.connection, time.monotonic())
-        except (OSError, ProtocolError):
+        if client.read(time.monotonic()):
+            self._waiting[client] = port
+            # One message at once: a command counts in the period in which it comes.
+            if self._step(port, client):
+                self._flush(port, client)
+        elif not client.sends:
             self._drop(port, client)
 
     def _take_faults(self) -> None:
@@ -295,48 +352,53 @@ class _Server:
             if self._stuck(port):
                 continue
             for client in list(port.clients):
-                try:
-                    client.outbox.flush(client.connection, now)
-                except OSError:
-                    self._drop(port, client)
-                    continue
-                if isinstance(client.session, DashboardSession) and client.session.ended and client.outbox.empty:
-                    self._drop(port, client)
+                self._flush(port, client)
 
     def _send_packages(self, now: float, snapshot: Snapshot, tick: int) -> None:
         for client in self._rtde.clients:
             assert isinstance(client.session, RtdeSession)
             package = client.session.package(snapshot, tick)
             if package is not None:
-                client.outbox.put(self._garbled(self._rtde, package), now, droppable=True)
+                client.send(self._garbled(self._rtde, package), now, droppable=True)
 
     def _send_streams(self, now: float, snapshot: Snapshot) -> None:
         controller = self._controller
-        while controller.notes:
-            title, text = controller.notes.popleft()
-            message = note_message(controller.time, title, text)
+        for _ in range(min(len(controller.reports), _REPORTS_PER_PERIOD)):
+            message = report_message(controller.time, controller.reports.popleft())
             for port in self._primary:
                 for client in port.clients:
-                    client.outbox.put(message, now, droppable=True)
+                    client.send(message, now, droppable=True)
         if controller.ticks % _STATE_TICKS == 0:
             streams = [client for port in (*self._primary, *self._secondary) for client in port.clients]
             message = robot_state(controller, snapshot) if streams else b""
             for client in streams:
-                client.outbox.put(message, now, droppable=True)
+                client.send(message, now, droppable=True)
         ports = [port for port in self._realtime if not self._stuck(port)]
         readers = [client for port in ports for client in port.clients if not client.outbox.blocked]
         packet = realtime_packet(snapshot) if readers else b""
         for client in readers:
-            client.outbox.put(packet, now, droppable=True)
+            client.send(packet, now, droppable=True)
 
     def _put(self, port: Port, client: Client, data: bytes) -> None:
-        client.outbox.put(self._garbled(port, data), time.monotonic(), droppable=False)
+        if data:
+            client.send(self._garbled(port, data), time.monotonic(), droppable=False)
+
+    def _flush(self, port: Port, client: Client) -> None:
+        try:
+            client.flush(time.monotonic())
+        except UnreadAnswersError:
+            self._drop(port, client)
+            return
+        if isinstance(client.session, DashboardSession) and client.session.ended and client.outbox.empty:
+            self._drop(port, client)
 
     def _drop(self, port: Port, client: Client) -> None:
         if isinstance(client.session, RtdeSession):
             client.session.close()
         client.close()
-        port.clients.remove(client)
+        self._waiting.pop(client, None)
+        if client in port.clients:
+            port.clients.remove(client)
 
     # Faults of the links
 
@@ -372,16 +434,6 @@ class _Server:
                 port.open()
 
 
-def _launch(controller: Controller, script: Script) -> None:
-    """Run what a client has sent.
-
-    Raises:
-        ScriptError: the twin does not understand it, or it is not possible.
-    """
-    if script.is_control_loop:
-        controller.start(ControlLoop(controller, script.register_offset, script.path()).program)
-    elif script.secondary:
-        if controller.listens():
-            run_at_once(controller, script.statements())
-    else:
-        controller.start(Program(script.name, run_statements(controller, script.statements())))
+def _streams(client: Client) -> bool:
+    """Whether a client gets data packages, and so need not say anything."""
+    return isinstance(client.session, RtdeSession) and client.session.streaming

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.geometry import ur5e
-from sim_twin.devices.arm import ROTATION_LEVER_M
+from robotcell.geometry.transforms import matrix_to_rotvec
+from sim_twin.devices.arm_limits import ROTATION_LEVER_M
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.pose import displaced, pose_to_matrix, rotation_vector
+from sim_twin.wire.ur.pose import displaced, pose_to_matrix
 from sim_twin.wire.ur.program import ScriptError, Thread
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def servo_circular(arm: Arm, pose: Sequence[float], speed: float, acceleration: 
     T_goal = pose_to_matrix(pose)
     while True:
         T = arm.forward(arm.q)
-        way = np.concatenate([T_goal[:3, 3] - T[:3, 3], rotation_vector(T_goal[:3, :3] @ T[:3, :3].T)])
+        way = np.concatenate([T_goal[:3, 3] - T[:3, 3], matrix_to_rotvec(T_goal[:3, :3] @ T[:3, :3].T)])
         distance = max(float(np.linalg.norm(way[:3])), float(np.linalg.norm(way[3:])) * ROTATION_LEVER_M)
         approach = min(speed, math.sqrt(2 * acceleration * distance))
         if distance <= approach * PERIOD_S:

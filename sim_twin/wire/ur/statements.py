@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.moves import follow
+from sim_twin.wire.ur.moves import Move, follow
 from sim_twin.wire.ur.program import ScriptError
 from sim_twin.wire.ur.registers import Payload
 from sim_twin.wire.ur.script import PoseValue, Statement, Value, argument, move_of, number_of, numbers_of
@@ -16,50 +16,91 @@ from sim_twin.wire.ur.stops import stop_joints, stop_line
 from sim_twin.wire.ur.variables import BIT_REGISTERS, REGISTERS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Iterator
 
     from sim_twin.wire.ur.controller import Controller
     from sim_twin.wire.ur.program import Thread
 
 _Action: TypeAlias = "Callable[[Controller, Statement], Thread | None]"
 
+_MOVES = frozenset({"movej", "movel", "movep"})
+# So many statements that take no time are done in a period: a long row of them must not hold it up.
+AT_ONCE = 20
 
-def run_statements(controller: Controller, statements: Sequence[Statement]) -> Thread:
-    """A thread that carries out statements one after another. Moves that follow each other blend.
+
+def check_statement(statement: Statement) -> None:
+    """See that the twin knows a statement, before anything of its program runs.
 
     Raises:
-        ScriptError: a statement is not known or not possible; it says which.
+        ScriptError: it does not.
     """
-    waiting = list(statements)
-    while waiting:
-        statement = waiting.pop(0)
-        if statement.name in _MOVES:
-            moves = [move_of(statement)]
-            while waiting and waiting[0].name in _MOVES:
-                moves.append(move_of(waiting.pop(0)))
-            yield from follow(controller.arm, moves)
-            continue
+    if statement.name in _MOVES:
+        move_of(statement)
+    elif statement.name != "halt" and statement.name not in _ACTIONS:
+        raise ScriptError(
+            f"the twin does not know {statement.name[:60]}",
+            statement.line,
+            f"compile_error_name_not_found:{statement.name[:60]}:",
+        )
+
+
+def run_statements(controller: Controller, statements: Iterable[Statement]) -> Thread:
+    """A thread that carries out statements one after another. Moves that follow each other blend.
+
+    Args:
+        controller: that carries them out.
+        statements: that `check_statement` has found right. Each is taken when its turn comes, or a move before it.
+
+    Raises:
+        ScriptError: a statement is not possible; it says which.
+    """
+    ahead = _Ahead(statements)
+    at_once = 0
+    while (statement := ahead.take()) is not None:
         if statement.name == "halt":
             return
-        action = _ACTIONS.get(statement.name)
-        if action is None:
-            raise ScriptError(f"line {statement.line}: the twin does not know {statement.name}")
-        motion = action(controller, statement)
+        if statement.name in _MOVES:
+            yield from follow(controller.arm, ahead.moves(statement))
+            at_once = 0
+            continue
+        motion = _ACTIONS[statement.name](controller, statement)
         if motion is not None:
             yield from motion
+            at_once = 0
+            continue
+        at_once += 1
+        if at_once % AT_ONCE == 0:
+            yield
 
 
-def run_at_once(controller: Controller, statements: Sequence[Statement]) -> None:
+def run_at_once(controller: Controller, statements: Iterable[Statement]) -> None:
     """Carry out a secondary program: nothing in it may take time.
 
     Raises:
-        ScriptError: a statement is not known, not possible, or a motion.
+        ScriptError: a statement is not possible, or a motion.
     """
     for _ in run_statements(controller, statements):
         raise ScriptError("a secondary program must not move the arm or wait")
 
 
-_MOVES = frozenset({"movej", "movel", "movep"})
+class _Ahead:
+    """Statements in their order, with a look at the next one."""
+
+    def __init__(self, statements: Iterable[Statement]) -> None:
+        self._rest = iter(statements)
+        self._next = next(self._rest, None)
+
+    def take(self) -> Statement | None:
+        """The next statement, None at the end."""
+        taken, self._next = self._next, next(self._rest, None)
+        return taken
+
+    def moves(self, first: Statement) -> Iterator[Move]:
+        """A move, and those that follow it directly."""
+        yield move_of(first)
+        while self._next is not None and self._next.name in _MOVES:
+            yield move_of(self._next)
+            self.take()
 
 
 def _stop_joints(controller: Controller, statement: Statement) -> Thread:
@@ -106,7 +147,7 @@ def _set_tcp(controller: Controller, statement: Statement) -> None:
 def _set_payload(controller: Controller, statement: Statement) -> None:
     mass = number_of(statement, 0, "m")
     if mass < 0:
-        raise ScriptError(f"line {statement.line}: {statement.name}: the mass must not be negative")
+        raise statement.refused("the mass must not be negative")
     old = controller.payload
     given = len(statement.arguments) > 1 or "cog" in statement.keywords
     cog = numbers_of(statement, 1, "cog", 3) if given else old.cog
@@ -140,7 +181,7 @@ def _analog(controller: Controller, statement: Statement) -> None:
 def _write_int(controller: Controller, statement: Statement) -> None:
     value = number_of(statement, 1, "value")
     if not -(2**31) <= value < 2**31:
-        raise ScriptError(f"line {statement.line}: {value:g} does not fit an integer register")
+        raise statement.refused(f"{value:g} does not fit an integer register")
     controller.registers.output_int[_index(statement, REGISTERS)] = int(value)
 
 
@@ -170,7 +211,7 @@ def _free(on: bool) -> _Action:
 def _index(statement: Statement, count: int) -> int:
     number = number_of(statement, 0, "n")
     if not 0 <= number < count or number != int(number):
-        raise ScriptError(f"line {statement.line}: {statement.name}: there are only {count}, from 0")
+        raise statement.refused(f"there are only {count}, from 0")
     return int(number)
 
 

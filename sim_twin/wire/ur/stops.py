@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim_twin.devices.arm import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
+from sim_twin.devices.arm_limits import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
 from sim_twin.wire.shared_state import PERIOD_S
 from sim_twin.wire.ur.arm import braked
 from sim_twin.wire.ur.pose import displaced

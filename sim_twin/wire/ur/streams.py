@@ -12,18 +12,26 @@ from typing import TYPE_CHECKING
 from robotcell.geometry import ur5e
 from sim_twin.wire.ur.controller import VERSION
 from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
+from sim_twin.wire.ur.reports import ErrorCode, ProgramEvent, RuntimeException, SafetyChange, Text
 from sim_twin.wire.ur.snapshot import joint_mode
 
 if TYPE_CHECKING:
     from sim_twin.wire.ur.controller import Controller
+    from sim_twin.wire.ur.reports import Report
     from sim_twin.wire.ur.snapshot import Snapshot
 
 STATE_PERIOD_S = 0.1
 
 _ROBOT_STATE, _ROBOT_MESSAGE = 16, 20
-_TEXT_MESSAGE, _VERSION_MESSAGE, _KEY_MESSAGE = 0, 3, 7
+_TEXT_MESSAGE, _VERSION_MESSAGE, _SAFETY_MODE_MESSAGE, _ERROR_CODE_MESSAGE = 0, 3, 5, 6
+_KEY_MESSAGE, _RUNTIME_EXCEPTION_MESSAGE = 7, 10
+# Report level of an error code; the twin knows no columns.
+_VIOLATION = 3
+_FIRST_COLUMN = 1
+_LONGEST_TEXT = 1000
+# "Linearised": UR's client library takes no other status for a calibrated arm.
+_CALIBRATED = 2
 _NO_TIMESTAMP = 2**64 - 1
-_NAMES = {"PROGRAM_XXX_STARTED", "PROGRAM_XXX_STOPPED"}
 # controlMode POSITION; masterboard types of an e-Series UR5.
 _POSITION_CONTROL = 0
 _ROBOT_TYPE_UR5, _E_SERIES = 1, 1
@@ -42,15 +50,30 @@ def version_message() -> bytes:
     return _robot_message(_NO_TIMESTAMP, _VERSION_MESSAGE, body)
 
 
-def note_message(time_s: float, title: str, text: str) -> bytes:
-    """What happened, for primary clients: a program's start and end as a key message, the rest as text."""
-    data = text.encode("latin-1", "replace")[:1000]
-    microseconds = round(time_s * 1e6)
-    if title not in _NAMES:
-        words = title.encode("latin-1", "replace") + b": " + data if title != "textmsg" else data
-        return _robot_message(microseconds, _TEXT_MESSAGE, words)
-    name = title.encode()
-    return _robot_message(microseconds, _KEY_MESSAGE, struct.pack(">iiB", 0, 0, len(name)) + name + data)
+def report_message(time_s: float, report: Report) -> bytes:
+    """What happened, for primary clients."""
+    kind, body = _body(report)
+    return _robot_message(round(time_s * 1e6), kind, body)
+
+
+def _body(report: Report) -> tuple[int, bytes]:
+    match report:
+        case Text(text):
+            return _TEXT_MESSAGE, _latin(text)
+        case ProgramEvent(name, started):
+            title = b"PROGRAM_XXX_STARTED" if started else b"PROGRAM_XXX_STOPPED"
+            return _KEY_MESSAGE, struct.pack(">iiB", 0, 0, len(title)) + title + _latin(name)
+        case RuntimeException(line, text):
+            return _RUNTIME_EXCEPTION_MESSAGE, struct.pack(">ii", line, _FIRST_COLUMN) + _latin(text)
+        case ErrorCode(code, argument, text):
+            return _ERROR_CODE_MESSAGE, struct.pack(">iiiII", code, argument, _VIOLATION, 0, 0) + _latin(text)
+        case SafetyChange(mode, cause):
+            code, argument = (cause.code, cause.argument) if cause is not None else (0, 0)
+            return _SAFETY_MODE_MESSAGE, struct.pack(">iiBII", code, argument, mode, 0, 0)
+
+
+def _latin(text: str) -> bytes:
+    return text.encode("latin-1", "replace")[:_LONGEST_TEXT]
 
 
 def robot_state(controller: Controller, values: Snapshot) -> bytes:
@@ -183,10 +206,10 @@ def _masterboard_data(controller: Controller) -> bytes:
 
 
 def _kinematics_data() -> bytes:
-    """Nominal Denavit-Hartenberg values; the checksums are those of an arm without calibration."""
+    """Nominal Denavit-Hartenberg values, which are exact for this arm: it counts as calibrated. No checksums."""
     theta = (0.0,) * 6
     numbers = (*theta, *ur5e.DH_A, *ur5e.DH_D, *ur5e.DH_ALPHA)
-    return struct.pack(">6I24dI", *(0,) * 6, *numbers, 0)
+    return struct.pack(">6I24dI", *(0,) * 6, *numbers, _CALIBRATED)
 
 
 def _configuration_data() -> bytes:

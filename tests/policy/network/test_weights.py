@@ -193,7 +193,7 @@ def test_what_is_no_weights_file_is_refused_and_not_run(tmp_path):
             return (tmp_path.joinpath("sprung").touch, ())
 
     path = tmp_path / "weights.safetensors"
-    refused(path, r"cannot be read \(No such file or directory\); name a file that exists")
+    refused(path, r"no such file; name one that exists")
     refused(tmp_path, "cannot be read")
     for content in (b"", b"hello", b"\xff" * 100, pickle.dumps(Trap()), b"\x02\0\0\0\0\0\0\0{}" + b"x"):
         path.write_bytes(content)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from robotcell.geometry.transforms import (
     check_transform,
@@ -38,6 +39,22 @@ def test_cross_is_the_cross_product(a: np.ndarray, b: np.ndarray) -> None:
 def test_rotation_vectors_round_trip(rotvec: np.ndarray) -> None:
     assume(np.linalg.norm(rotvec) < np.pi - 1e-3)
     np.testing.assert_allclose(matrix_to_rotvec(rotvec_to_matrix(rotvec)), rotvec, atol=1e-9)
+
+
+@given(vector)
+def test_rotation_vectors_are_those_of_scipy(rotvec: np.ndarray) -> None:
+    there = Rotation.from_rotvec(rotvec)
+    np.testing.assert_allclose(rotvec_to_matrix(rotvec), there.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(rotvec_to_matrix([rotvec, -rotvec])[1], there.inv().as_matrix(), atol=1e-12)
+    assume(there.magnitude() < np.pi - 1e-3)
+    np.testing.assert_allclose(matrix_to_rotvec(there.as_matrix()), there.as_rotvec(), atol=1e-9)
+
+
+def test_half_a_turn_has_a_rotation_vector() -> None:
+    for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0.6, 0, 0.8)):
+        R = rotvec_to_matrix(np.pi * np.array(axis))
+        np.testing.assert_allclose(rotvec_to_matrix(matrix_to_rotvec(R)), R, atol=1e-12)
+    assert not matrix_to_rotvec(np.eye(3)).any()
 
 
 @given(transforms, transforms, st.floats(0, 1))

@@ -5,7 +5,7 @@ from robotcell.errors import ConnectionLost, DeviceFault
 from robotcell.geometry import ur5e
 from robotcell.geometry.transforms import rotation_z
 from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode
-from sim_twin.devices.arm import PROTECTIVE_FORCE_N
+from sim_twin.devices.arm_limits import PROTECTIVE_FORCE_N
 from sim_twin.world import robot_model
 from tests.sim_twin.cells import close_on, finish, go, joints_at, open_twin, tool_down, with_block
 

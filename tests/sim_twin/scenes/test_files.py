@@ -354,7 +354,7 @@ def test_every_mistake_is_reported_at_once_and_names_are_unique(tmp_path):
         scene_of(tmp_path, 'name = "s"\n' + entry + entry, suffix=".toml")
     with pytest.raises(ConfigError, match="2 mistake"):
         scene_of(tmp_path, 'name = ""\n', suffix=".toml")
-    with pytest.raises(ConfigError, match="no such scene file"):
+    with pytest.raises(ConfigError, match="no such file"):
         read_scene(tmp_path / "none.toml", None)
 
 

@@ -1,3 +1,5 @@
+import json
+import struct
 from contextlib import suppress
 
 import numpy as np
@@ -82,7 +84,7 @@ def test_a_malformed_obj_file_is_refused_with_file_and_reason(tmp_path, text, me
 
 @pytest.mark.parametrize("suffix", MESH_SUFFIXES)
 def test_a_missing_mesh_file_is_refused(tmp_path, suffix):
-    with pytest.raises(ConfigError, match="no such mesh file"):
+    with pytest.raises(ConfigError, match="no such file"):
         load_meshes(tmp_path / f"none{suffix}")
 
 
@@ -206,3 +208,42 @@ def test_a_mesh_in_other_units_is_refused(tmp_path, factor, message):
     )
     with pytest.raises(ConfigError, match=message):
         load_shape(written(tmp_path, "\n".join(lines)))
+
+
+def test_a_backslash_continues_a_line(tmp_path):
+    text = CUBE_OBJ.replace("f 4 3 2 1", "f 4 3 \\\n2 1").replace("v 1 0 0\n", "v 1 \\\r\n0 0\n")
+    (mesh,) = load_meshes(written(tmp_path, text))
+    assert mesh_volume(mesh) == pytest.approx(1)
+
+
+def glb(change):
+    """A box as a GLB file whose description was changed."""
+    data = bytes(trimesh.creation.box((0.05, 0.04, 0.03)).export(file_type="glb"))
+    (length,) = struct.unpack("<I", data[12:16])
+    document = json.loads(data[20 : 20 + length])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + data[20 + length :]
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def ask_for_zeros(document):
+    for accessor in document["accessors"]:
+        del accessor["bufferView"]
+        accessor["count"] = 2_000_000_000
+
+
+def use_often(document):
+    (mesh,) = (node["mesh"] for node in document["nodes"] if "mesh" in node)
+    first = len(document["nodes"])
+    document["nodes"] += [{"mesh": mesh} for _ in range(500)]
+    document["scenes"][0]["nodes"] += range(first, first + 500)
+
+
+@pytest.mark.parametrize(("change", "message"), [(ask_for_zeros, "array of 2000000000"), (use_often, "6012 triangles")])
+def test_a_small_file_cannot_ask_for_much_memory(tmp_path, change, message):
+    path = tmp_path / "mesh.glb"
+    path.write_bytes(glb(change))
+    with pytest.raises(ConfigError, match=message):
+        load_meshes(path)

@@ -7,6 +7,7 @@ import time
 from multiprocessing.shared_memory import SharedMemory
 
 import pytest
+from pymodbus.client import ModbusTcpClient
 
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.cell import ServedCell
@@ -40,6 +41,22 @@ def test_the_world_and_the_controller_live(served):
     while served.state()["t"] <= state["t"] or served.command()["tick"] <= command["tick"]:
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def test_a_stop_directly_followed_by_a_grip_moves_the_fingers(served):
+    """As a common ROS 2 driver writes it: back to back on one connection."""
+    host, _, port = served.endpoints["modbus"].rpartition(":")
+    with ModbusTcpClient(host, port=int(port), timeout=LIMIT_S, retries=0) as client:
+        client.write_register(0, 200, device_id=65)
+        for width in (300, 700, 400, 800):
+            # The first grip is under way when the stop comes.
+            client.write_registers(1, [1000, 16], device_id=65)
+            for register, value in ((2, 8), (1, width), (2, 16)):
+                assert not client.write_register(register, value, device_id=65).isError()
+            end = time.monotonic() + LIMIT_S
+            while abs(client.read_holding_registers(267, count=1, device_id=65).registers[0] - width) > 5:
+                assert time.monotonic() < end, f"the grip to {width} was lost"
+                time.sleep(0.02)
 
 
 def test_a_port_that_is_taken_is_named():

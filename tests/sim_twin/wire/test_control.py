@@ -66,6 +66,24 @@ def test_it_hangs_up_on_a_flood_and_lives_on(control):
     assert ask(control.endpoint, {"list": True})["ok"]
 
 
+@pytest.mark.parametrize("line", ["[" * 9_000, '{"a":' * 1_900, '{"inject": ' + "[" * 5000 + "]" * 4000])
+def test_json_that_is_nested_deeply_is_refused(control, line):
+    answer = answer_to(control.endpoint, line)
+    assert not answer["ok"]
+    assert "JSON" in answer["error"]
+    assert ask(control.endpoint, {"list": True})["ok"]
+
+
+def test_a_crowd_of_connections_does_not_lock_it(control):
+    host, _, port = control.endpoint.rpartition(":")
+    with contextlib.ExitStack() as stack:
+        crowd = [stack.enter_context(socket.create_connection((host, int(port)), timeout=5)) for _ in range(600)]
+        assert ask(control.endpoint, {"list": True})["ok"]
+        # One of the last is still there.
+        crowd[-1].sendall(b'{"list": true}\n')
+        assert crowd[-1].recv(1) == b"{"
+
+
 def test_it_listens_on_this_machine_alone(served):
     with ControlSocket(served, "0.0.0.0", 0) as control:
         assert control.endpoint.startswith("127.0.0.1:")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from sim_twin.wire.cell import ServedCell
 
-SECONDS = 1.0
+SECONDS = 0.5
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +64,7 @@ def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> 
     path = tmp_path / "absent.toml"
     path.write_text(cell_text("127.0.0.49"))
     begin = time.monotonic()
-    result = CliRunner().invoke(app, ["doctor", "--cell", str(path), "--json", "--seconds", "5"])
+    result = CliRunner().invoke(app, ["doctor", "--cell", str(path), "--json", "--seconds", "0.5"])
     assert time.monotonic() - begin < 10.0
     assert result.exit_code == 3
     report = json.loads(result.stdout)
@@ -122,7 +122,7 @@ def test_recover_asks_first_and_then_leaves_the_stop(served: ServedCell, cell_fi
     # Of a protective stop the controller lets nobody go for 5 s; tests/robotcell/drivers/ur5e waits for that.
     with make_arm() as arm:
         served.inject(fault("state", Kind.WRONG, "program_paused"))
-        wait_until(lambda: arm.state().mode is ArmMode.NOT_READY, 1.0)
+        wait_until(lambda: arm.state().mode is ArmMode.NOT_READY)
         runner = CliRunner()
         for answer in ("n\n", ""):
             refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input=answer)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sim_twin.wire.cell import ServedCell
 
 PERIOD_S = 0.008
+LIMIT_S = 20.0
 # A controller that is lost, silent or garbling is an error within a second; a busy machine gets as much again.
 LOST_S = 2.0
 # From the moment that something dies until the arm stands.
@@ -88,8 +89,8 @@ def works(arm: UR5e) -> None:
     go_home(arm)
 
 
-def wait_until(condition: Callable[[], bool], seconds: float) -> float:
-    """Wait for something; how long that took [s]."""
+def wait_until(condition: Callable[[], bool], seconds: float = LIMIT_S) -> float:
+    """Wait for something; how long that took [s]. The limit is to end the test, unless another is given."""
     begin = time.monotonic()
     while not condition():
         assert time.monotonic() - begin < seconds, f"not within {seconds} s"

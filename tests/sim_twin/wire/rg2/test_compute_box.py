@@ -141,6 +141,27 @@ def test_busy_from_the_command_on_and_deaf_meanwhile(bench):
     assert bench.command.read()["width_m"] == pytest.approx(0.05)
 
 
+def test_a_grip_counts_right_after_a_stop(bench):
+    bench.units.write(65, 0, [250, 300, 16])
+    bench.take_up(busy=True)
+    # Nothing of this has reached the world yet, which still says that the fingers move.
+    bench.units.write(65, 2, [8])
+    bench.units.write(65, 1, [500])
+    bench.units.write(65, 2, [16])
+    assert bench.command.read()["width_m"] == pytest.approx(0.05)
+    assert not bench.command.read()["stop"]
+    bench.units.write(65, 1, [600])
+    bench.units.write(65, 2, [16])
+    assert bench.command.read()["width_m"] == pytest.approx(0.05), "the second grip came while busy"
+
+
+def test_a_stop_does_not_end_a_fault_that_is_busy_for_ever(bench):
+    bench.set_faults(("state", Kind.WRONG, "busy"))
+    bench.units.write(65, 2, [8])
+    bench.units.write(65, 0, [250, 300, 16])
+    assert bench.command.read()["stop"]
+
+
 def test_a_grip_is_reported(bench):
     bench.state.write(grip_detected=True)
     assert bench.read(268) == 2

@@ -1,10 +1,12 @@
+import asyncio
+import socket
 import struct
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_twin.wire.rg2.modbus import Refusal, RefusedError, answer, split_frames
+from sim_twin.wire.rg2.modbus import ModbusServer, Refusal, RefusedError, answer, split_frames
 
 PDUS = st.binary(min_size=1, max_size=253)
 # Mostly function codes that exist, with plausible numbers.
@@ -107,3 +109,97 @@ def test_a_write_and_read_that_cannot_read_does_not_write():
 
 def test_an_unknown_unit_meets_silence():
     assert answer(frame(struct.pack(">BHH", 3, 0, 1), unit=66), Ten()) is None
+
+
+# The server
+
+
+HOST = "127.0.0.36"
+READ = frame(struct.pack(">BHH", 3, 8, 2))
+RESPONSE = frame(struct.pack(">BBHH", 3, 4, 8, 9))
+
+
+def serve(talk, units=None, **patience):
+    """Let clients talk to a server of ten registers."""
+
+    async def run():
+        server = ModbusServer(units or Ten(), HOST, 0, **patience)
+        await server.open()
+        try:
+            await asyncio.wait_for(talk(server), 20)
+        finally:
+            await server.close()
+
+    asyncio.run(run())
+
+
+async def ask(client):
+    reader, writer = client
+    writer.write(READ)
+    return await reader.read(len(RESPONSE))
+
+
+async def hang_up(*clients):
+    for _, writer in clients:
+        writer.close()
+        await writer.wait_closed()
+
+
+def test_a_client_that_never_asks_makes_room_for_the_next():
+    async def talk(server):
+        first, second = [await asyncio.open_connection(HOST, server.port) for _ in range(2)]
+        assert await second[0].read() == b"", "the first one had its time"
+        await asyncio.sleep(0.15)
+        third = await asyncio.open_connection(HOST, server.port)
+        assert await ask(third) == RESPONSE
+        assert await first[0].read() == b""
+        await hang_up(first, second, third)
+
+    serve(talk, first_request_s=0.1, next_request_s=60)
+
+
+def test_a_client_that_asks_keeps_its_place():
+    async def talk(server):
+        first = await asyncio.open_connection(HOST, server.port)
+        assert await ask(first) == RESPONSE
+        await asyncio.sleep(0.05)
+        second = await asyncio.open_connection(HOST, server.port)
+        assert await second[0].read() == b""
+        assert await ask(first) == RESPONSE
+        await hang_up(first, second)
+
+    serve(talk, first_request_s=0.01, next_request_s=60)
+
+
+def test_a_client_that_never_reads_is_not_listened_to_for_ever():
+    units, requests = Counting(), 20_000
+
+    async def talk(server):
+        with socket.socket() as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            client.setblocking(False)
+            loop = asyncio.get_running_loop()
+            await loop.sock_connect(client, (HOST, server.port))
+            sending = asyncio.create_task(loop.sock_sendall(client, READ * requests))
+            answered = -1
+            while answered != units.reads and units.reads < requests:
+                answered = units.reads
+                await asyncio.sleep(0.2)
+            assert units.reads < requests, "it was listened to all the time"
+            # What waits is answered once it reads.
+            received = 0
+            while received < requests * len(RESPONSE):
+                received += len(await loop.sock_recv(client, 1 << 20))
+            await sending
+
+    serve(talk, units)
+
+
+class Counting(Ten):
+    """Counts what is read."""
+
+    reads = 0
+
+    def read(self, unit, address, count):
+        self.reads += 1
+        return super().read(unit, address, count)

@@ -10,6 +10,7 @@ from sim_twin.wire.shared_state import CELL_STATE, PERIOD_S
 from sim_twin.wire.ur.control_loop import DONE, READY, ControlLoop
 from sim_twin.wire.ur.controller import Controller
 from sim_twin.wire.ur.modes import RuntimeState
+from sim_twin.wire.ur.script_reader import ScriptReader
 from tests.sim_twin.wire.ur.stub_world import START_Q
 
 if TYPE_CHECKING:
@@ -17,6 +18,26 @@ if TYPE_CHECKING:
 
     from robotcell.geometry.transforms import Array
     from sim_twin.wire.ur.moves import Move
+    from sim_twin.wire.ur.ports import Session
+    from sim_twin.wire.ur.script_reader import Received
+
+
+def answers(session: Session, data: bytes) -> bytes:
+    """What a session answers to these bytes."""
+    session.feed(data)
+    return b"".join(iter(session.step, None))
+
+
+def received(data: bytes, reader: ScriptReader | None = None) -> list[Received]:
+    """What is complete with these bytes, and what is refused."""
+    reader = reader or ScriptReader()
+    reader.feed(data)
+    found = []
+    while reader.waiting:
+        one = reader.read_line()
+        if one is not None:
+            found.append(one)
+    return found
 
 
 class SteppedController:
@@ -52,7 +73,7 @@ class SteppedController:
         raise AssertionError("the arm does not come to rest")
 
     def notes(self) -> str:
-        return "\n".join(f"{title}: {text}" for title, text in self.controller.notes)
+        return "\n".join(str(report) for report in self.controller.reports)
 
 
 class SteppedControlLoop(SteppedController):

@@ -16,15 +16,13 @@ from sim_twin.wire.faults import Fault, FaultInbox, Kind
 from sim_twin.wire.shared_state import CELL_STATE
 from sim_twin.wire.ur.controller import UNLOCK_AFTER_S
 from sim_twin.wire.ur.dashboard import DashboardSession
+from sim_twin.wire.ur.launch import launch
 from sim_twin.wire.ur.modes import RobotMode, RuntimeState, SafetyMode
 from sim_twin.wire.ur.pose import matrix_to_pose
-from sim_twin.wire.ur.program import Program, ScriptError
-from sim_twin.wire.ur.script import ScriptReader
 from sim_twin.wire.ur.server import ARM_FAULTS
 from sim_twin.wire.ur.snapshot import Snapshot
 from sim_twin.wire.ur.state_faults import StateFaults
-from sim_twin.wire.ur.statements import run_at_once, run_statements
-from tests.sim_twin.wire.ur.stepped_controller import SteppedController, SteppedControlLoop
+from tests.sim_twin.wire.ur.stepped_controller import SteppedController, SteppedControlLoop, answers, received
 from tests.sim_twin.wire.ur.stub_world import START_Q
 
 if TYPE_CHECKING:
@@ -45,14 +43,19 @@ def moving() -> SteppedControlLoop:
 
 def ask(stepped: SteppedController, *lines: str) -> list[str]:
     """What the dashboard answers to each line."""
-    answer = DashboardSession(stepped.controller).feed("".join(f"{line}\n" for line in lines).encode())
+    answer = answers(DashboardSession(stepped.controller), "".join(f"{line}\n" for line in lines).encode())
     return answer.decode().splitlines()
+
+
+def send(stepped: SteppedController, text: str) -> None:
+    """Send what the controller is to run."""
+    for one in received(text.encode()):
+        launch(stepped.controller, one)
 
 
 def run(stepped: SteppedController, text: str, limit: float = 20.0) -> None:
     """Send a program and wait until it has ended."""
-    [script] = ScriptReader().feed(text.encode())
-    assert stepped.controller.start(Program(script.name, run_statements(stepped.controller, script.statements())))
+    send(stepped, text)
     for _ in range(round(limit / 0.002)):
         stepped.tick()
         if stepped.controller.runtime is RuntimeState.STOPPED:
@@ -276,24 +279,22 @@ def test_one_line_is_a_program() -> None:
 )
 def test_what_a_script_may_not_is_said_and_ends_it(text: str, says: str) -> None:
     stepped = SteppedController()
-    try:
-        run(stepped, text)
-    except ScriptError as error:
-        assert says in str(error)
-    else:
-        assert says in stepped.notes()
+    run(stepped, text)
+    assert says in stepped.notes()
     np.testing.assert_array_equal(stepped.q, START)
 
 
 def test_a_secondary_program_runs_beside_the_main_one() -> None:
     stepped = moving()
-    [script] = ScriptReader().feed(b"sec s():\n  set_digital_out(0, True)\nend\n")
-    run_at_once(stepped.controller, script.statements())
+    send(stepped, "sec s():\n  set_digital_out(0, True)\nend\n")
     assert stepped.controller.outputs.digital == 1
     assert stepped.running
-    [script] = ScriptReader().feed(b"sec s():\n  sleep(1)\nend\n")
-    with pytest.raises(ScriptError, match="must not move"):
-        run_at_once(stepped.controller, script.statements())
+    for text in ("sec s():\n  sleep(1)\nend\n", "sec s():\n" + "  sync()\n" * 21 + "end\n", "sec s():\n x=1\nend\n"):
+        send(stepped, text)
+        assert stepped.running, text
+    assert "must not move" in stepped.notes()
+    assert "more than 20" in stepped.notes()
+    assert "syntax_error_on_line:2:x=1:" in stepped.notes()
 
 
 # Power and stops
@@ -364,7 +365,15 @@ def test_the_dashboard_speaks_as_the_controller_does() -> None:
         "programState": "STOPPED",
         "running": "Program running: false",
         "get loaded program": "No program loaded",
-        "isProgramSaved": "true",
+        "isProgramSaved": "true null",
+        "saveLog": "Log saved to disk",
+        "generate flight report": "Flight Report generated with id: ",
+        "generate flight report controller": "Flight Report generated with id: ",
+        "generate flight report lunch": "Error generating flight report: lunch",
+        "generate support file /programs": "Completed successfully: ur_2",
+        "generate support file": "Error",
+        "get operational mode": "NONE",
+        "set operational mode manual": "Operational mode manual is set",
         "play": "Failed to execute: play",
         "pause": "Failed to execute: pause",
         "stop": "Stopped",
@@ -378,31 +387,46 @@ def test_the_dashboard_speaks_as_the_controller_does() -> None:
         "nonsense": 'could not understand: "nonsense"',
         "shutdown": "Shutting down",
     }
-    answers = ask(stepped, *talk)
-    assert len(answers) == len(talk)
+    said = ask(stepped, *talk)
+    assert len(said) == len(talk)
     wrong = {
-        line: answer
-        for (line, start), answer in zip(talk.items(), answers, strict=True)
-        if answer[: len(start)] != start
+        line: answer for (line, start), answer in zip(talk.items(), said, strict=True) if answer[: len(start)] != start
     }
     assert not wrong
-    assert answers[1].isdigit()
+    assert said[1].isdigit()
+
+
+def test_the_operational_mode_is_read_back() -> None:
+    stepped = SteppedController()
+    mode = "get operational mode"
+    assert ask(stepped, "set operational mode AUTOMATIC", mode) == ["Operational mode AUTOMATIC is set", "AUTOMATIC"]
+    assert ask(stepped, "set operational mode lunch", mode) == ["Failed setting operational mode: lunch", "AUTOMATIC"]
+    assert ask(stepped, "clear operational mode", mode) == [
+        "No longer controlling the operational mode. Current operational mode: 'NONE'.",
+        "NONE",
+    ]
+
+
+def test_the_program_that_runs_is_named() -> None:
+    stepped = SteppedController()
+    send(stepped, "def stacking():\n  sleep(1)\nend\n")
+    assert ask(stepped, "programState", "isProgramSaved") == ["PLAYING stacking", "true stacking"]
 
 
 def test_nothing_is_answered_after_a_goodbye() -> None:
     session = DashboardSession(SteppedController().controller)
-    assert session.feed(b"quit\nrobotmode\n") == b"Disconnected\n"
+    assert answers(session, b"quit\nrobotmode\n") == b"Disconnected\n"
     assert session.ended
 
 
 @given(st.lists(st.sampled_from([b"robotmode\n", b"\n", b"\xff\x00\n", b"stop\r\n"])), st.lists(st.integers(0, 60)))
 def test_lines_may_come_in_pieces(lines: list[bytes], cuts: list[int]) -> None:
     stream = b"".join(lines)
-    whole = DashboardSession(SteppedController().controller).feed(stream)
+    whole = answers(DashboardSession(SteppedController().controller), stream)
     assert whole.count(b"\n") == len(lines)
     session = DashboardSession(SteppedController().controller)
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    assert b"".join(session.feed(stream[a:b]) for a, b in itertools.pairwise(edges)) == whole
+    assert b"".join(answers(session, stream[a:b]) for a, b in itertools.pairwise(edges)) == whole
 
 
 # Faults of the state

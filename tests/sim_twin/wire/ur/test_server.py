@@ -31,7 +31,7 @@ START = np.array(START_Q)
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[ServedController]:
-    with ServedController(HOST) as served:
+    with ServedController(HOST, unlock_after_s=0.0) as served:
         yield served
 
 
@@ -55,8 +55,6 @@ def wait_for(condition: Callable[[], bool], limit: float = 10.0) -> None:
 def send(port: int, text: str) -> None:
     with socket.create_connection((HOST, port), timeout=2) as connection:
         connection.sendall(text.encode())
-        # Closed at once, what it never read would come back as a reset that may overtake the script.
-        time.sleep(0.1)
 
 
 def exactly(connection: socket.socket, count: int) -> bytes:
@@ -240,14 +238,124 @@ def test_the_tcp_counts_in_poses(served: ServedController) -> None:
         send(SCRIPT, "set_tcp(p[0,0,0,0,0,0])\n")
 
 
-def test_what_the_twin_does_not_understand_is_said_on_the_primary_port(served: ServedController) -> None:
-    with socket.create_connection((HOST, PRIMARY), timeout=2) as primary:
-        send(SCRIPT, "def p():\n  if True:\n  end\nend\n")
+@pytest.mark.parametrize("port", [PRIMARY, SECONDARY, SCRIPT])
+def test_a_client_that_closes_without_reading_still_gets_its_program_run(served: ServedController, port: int) -> None:
+    for number in range(10):
+        with socket.create_connection((HOST, port), timeout=2) as client:
+            # Something has come that nobody will ever read: closing the connection resets it.
+            client.recv(1, socket.MSG_PEEK)
+            client.sendall(f"write_output_integer_register(7, {number})\n".encode() * 2)
+        with reading(HOST, "output_int_register_7") as reader:
+            wait_for(lambda number=number: reader.newest()["output_int_register_7"] == number)
+
+
+def test_a_dashboard_client_that_closes_at_once_is_obeyed(served: ServedController) -> None:
+    send(SCRIPT, "def p():\n sleep(60)\nend\n")
+    with Dashboard() as dashboard, socket.create_connection((HOST, DASHBOARD), timeout=2) as hasty:
+        wait_for(lambda: dashboard.ask("programState") == "PLAYING p")
+        hasty.recv(1, socket.MSG_PEEK)
+        hasty.sendall(b"running\nstop\n")
+        hasty.close()
+        wait_for(lambda: dashboard.ask("programState") == "STOPPED null")
+
+
+def messages(primary: socket.socket, *kinds: int) -> list[bytes]:
+    """The next robot message of each kind, in this order, without its head."""
+    found: list[bytes] = []
+    end = time.monotonic() + 10
+    for wanted in kinds:
         while True:
+            assert time.monotonic() < end, f"no message of type {wanted} after {found}"
             kind, body = stream_message(primary)
-            if kind == 20 and body[9] == 0:
+            if kind == 20 and body[9] == wanted:
+                assert body[8] == 0xFD
+                found.append(body[10:])
                 break
-    assert b"line 2" in body
+    return found
+
+
+def test_a_program_that_is_not_understood_looks_failed_to_primary_clients(served: ServedController) -> None:
+    with socket.create_connection((HOST, PRIMARY), timeout=2) as primary:
+        send(SCRIPT, "def p():\n  write_output_integer_register(8, 1)\n  if True:\n  end\nend\n")
+        exception, text = messages(primary, 10, 0)
+        assert struct.unpack_from(">ii", exception) == (3, 1)
+        assert exception[8:] == b"syntax_error_on_line:3:if True::"
+        assert b"line 3" in text
+        send(SCRIPT, "def p():\n  movej([9,0,0,0,0,0])\nend\n")
+        started, exception, stopped = messages(primary, 7, 10, 7)
+        assert started[9:] == b"PROGRAM_XXX_STARTEDp"
+        assert struct.unpack_from(">ii", exception) == (2, 1)
+        assert b"joint limits" in exception
+        assert stopped[9:] == b"PROGRAM_XXX_STOPPEDp"
+        send(SCRIPT, "sec s():\n  fly()\nend\n")
+        [exception] = messages(primary, 10)
+        assert exception[8:] == b"SECONDARY_PROGRAM_EXCEPTION_XXXcompile_error_name_not_found:fly:"
+    with reading(HOST, "output_int_register_8") as reader:
+        assert reader.newest()["output_int_register_8"] == 0
+
+
+def test_a_protective_stop_is_told_with_its_code_and_left_by_a_line_of_script(served: ServedController) -> None:
+    with socket.create_connection((HOST, PRIMARY), timeout=2) as primary:
+        primary.recv(1, socket.MSG_PEEK)
+        served.push[:] = [0, 0, 200]
+        error, mode = messages(primary, 6, 5)
+        assert struct.unpack_from(">iiiII", error) == (157, -1, 3, 0, 0)
+        assert b"200 N" in error
+        assert struct.unpack(">iiBII", mode) == (157, -1, 3, 0, 0)
+        served.push[:] = 0
+        time.sleep(0.05)
+        primary.sendall(b"set unlock protective stop\n")
+        [mode] = messages(primary, 5)
+        assert struct.unpack(">iiBII", mode) == (0, 0, 1, 0, 0)
+
+
+def test_lines_of_script_power_the_arm(served: ServedController) -> None:
+    with socket.create_connection((HOST, PRIMARY), timeout=2) as primary, Dashboard() as dashboard:
+        for line, state in (("power off", "POWER_OFF"), ("power on", "IDLE"), ("set robotmode run", "RUNNING")):
+            primary.sendall(f"{line}\n".encode())
+            wait_for(lambda state=state: dashboard.ask("robotmode") == f"Robotmode: {state}")
+
+
+def test_a_program_that_takes_long_to_read_holds_up_nobody(served: ServedController) -> None:
+    # The world of a served arm without real-time priority may hold it up too, but never for so long.
+    longest_s = 1.0
+    text = b"def p():\n# inject move path\n" + b"\n" * 80_000 + b"# RTDE Control script - Main loop\nend\n"
+    with socket.create_connection((HOST, PRIMARY), timeout=20) as primary, reading(HOST, "timestamp") as good:
+        good.settimeout(60)
+        stamps = [good.package()["timestamp"]]
+        primary.sendall(text)
+        for _ in range(500):
+            stamps.append(good.package()["timestamp"])
+        [exception] = messages(primary, 10)
+    assert b"20000 lines" in exception
+    assert np.diff(stamps).max() < longest_s
+
+
+# Many clients
+
+
+@pytest.mark.parametrize("port", [DASHBOARD, SECONDARY, SCRIPT, RTDE])
+def test_silent_clients_give_way_to_new_ones(served: ServedController, port: int) -> None:
+    with contextlib.ExitStack() as stack, reading(HOST, "timestamp") as streaming, Dashboard() as talking:
+        talking.ask("running")
+        for _ in range(40):
+            stack.enter_context(socket.create_connection((HOST, port), timeout=2))
+        with socket.create_connection((HOST, port), timeout=2) as client:
+            if port == RTDE:
+                client.sendall(b"\x00\x03v")
+            assert client.recv(1)
+        # Neither one that listens to its packages nor one that has spoken is taken for silent.
+        streaming.newest()
+        assert talking.ask("running") == "Program running: false"
+
+
+def test_a_port_that_is_full_of_streams_takes_nobody_else(served: ServedController) -> None:
+    with contextlib.ExitStack() as stack:
+        clients = [stack.enter_context(reading(HOST, "timestamp", frequency=10)) for _ in range(32)]
+        with socket.create_connection((HOST, RTDE), timeout=2) as client, contextlib.suppress(ConnectionResetError):
+            assert client.recv(1) == b""
+        for client in clients:
+            client.package()
 
 
 @pytest.mark.parametrize("port", [PRIMARY, SECONDARY, 30011, 30012])
@@ -273,6 +381,7 @@ def test_the_state_streams_begin_with_the_version(served: ServedController, port
             joints = [struct.unpack_from(">3d", state[1], 41 * i)[0] for i in range(6)]
             assert joints == pytest.approx(START_Q)
             assert state[0][15] == 7
+            assert struct.unpack_from(">I", state[5], 216) == (2,), "calibrated"
             pose = struct.unpack_from(">6d", state[4])
             assert pose == pytest.approx(matrix_to_pose(ur5e.forward(START)), abs=1e-6)
 
