@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
@@ -13,7 +13,7 @@ from cli.console import error_as_json, print_json, progress, report_error, resul
 from cli.keyboard import KeyboardHold
 from policy import make_policy
 from robotcell.config import find_backend
-from robotcell.errors import CellError, ConfigError, NoTarget, UnsafeMotion
+from robotcell.errors import CellError, ConfigError, NoTarget, StorageError, UnsafeMotion
 from robotcell.io.images import write_image
 from robotcell.jobs.job import Report, preview, resume_job, run_job
 from robotcell.jobs.journal import Journal
@@ -143,7 +143,9 @@ def _run(
                 job_id, run_dir, False, str(stop), journal.metrics(job_id), journal.job(job_id).cell_s or 0.0
             )
         status.update("drawing the summary")
-        pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
+        # What stopped the job says more than pictures that cannot be written.
+        with nullcontext() if error is None else suppress(StorageError):
+            pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
         return report, error
 
 

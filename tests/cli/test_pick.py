@@ -113,10 +113,7 @@ def test_the_same_seed_gives_the_same_job_to_the_last_action_in_every_process(tm
 
 @pytest.mark.parametrize(
     ("number", "code", "words"),
-    [
-        (signal.SIGINT, 130, "interrupted"),
-        (signal.SIGHUP, 129, "the terminal was closed"),
-    ],
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGHUP, 129, "the terminal was closed")],
 )
 def test_a_job_that_is_cut_off_is_on_record_as_stopped(
     cell: Path, number: signal.Signals, code: int, words: str
