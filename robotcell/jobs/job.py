@@ -20,12 +20,11 @@ from robotcell.jobs.progress import Progress
 from robotcell.jobs.resuming import check_resumable, cut_off, judge_resumed, replay, settle, task_of
 from robotcell.jobs.run_folder import load_frame, make_run_dir, save_frame
 from robotcell.jobs.verdict import Outcome, Result, judge
-from robotcell.motion.actions import plan_action
 from robotcell.motion.config_check import check_config
 from robotcell.motion.executor import Ending
 from robotcell.motion.grasp import Grasp
-from robotcell.motion.path_check import check_path
 from robotcell.motion.retreat import at_home
+from robotcell.motion.way import plan_way
 from robotcell.perception.goals import find_goal
 from robotcell.perception.view import view_of
 
@@ -63,19 +62,22 @@ class Report:
     cell_s: float
 
 
-def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, CheckedPlan]:
-    """Look, decide, plan and check one action; nothing moves.
+def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, CheckedPlan | UnsafeMotion]:
+    """Look, decide, plan and check one action; nothing moves. A plan that is refused comes as the refusal.
 
     Raises:
-        ConfigError, NoTarget, UnsafeMotion: as in a job.
+        ConfigError, NoTarget: as in a job.
         ConnectionLost, DeviceFault, CalibrationError: as `Cell.look`.
     """
     check_config(cell.config)
     view = cell.look(policy.workspace)
     task = _task(view, goal, None)
     action = policy.decide(_observe(view, task, (), may_push=True))
-    plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
-    return Decision(1, goal, view, task, action), check_path(plan, cell.config)
+    decision = Decision(1, goal, view, task, action)
+    try:
+        return decision, plan_way(action, view.heightmap, view.clearance, cell.arm.state().q, cell.config)
+    except UnsafeMotion as refusal:
+        return decision, refusal
 
 
 def run_job(
@@ -280,13 +282,13 @@ class _Job:
     def _run(self, action_id: int, decision: Decision) -> tuple[View, Outcome]:
         cell, view = self.cell, decision.view
         try:
-            plan = plan_action(decision.action, view.heightmap, cell.arm.state().q, cell.config)
-            checked = check_path(plan, cell.config)
+            q = cell.arm.state().q
+            checked = plan_way(decision.action, view.heightmap, view.clearance, q, cell.config)
         except UnsafeMotion as error:
             return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan"))
         execution = cell.executor.run(checked, lambda label: self.journal.held(action_id, label))
         if execution.ending is not Ending.DONE:
-            cell.home()
+            cell.home(view.clearance)
         after = self._look()
         return after, judge(decision.action, decision.goal, view, after, execution)
 

@@ -9,7 +9,6 @@ from robotcell.geometry import rg2, ur5e
 from robotcell.motion.plan import (
     CheckHold,
     Grip,
-    LinearMove,
     MotionPlan,
     Step,
     guarded_move,
@@ -18,7 +17,7 @@ from robotcell.motion.plan import (
     linear_move,
 )
 from robotcell.motion.rotations import rotation_angle_rad
-from robotcell.motion.tool import near_height, solve_tool_down, tool_down
+from robotcell.motion.tool import near_height, solve_tool_down, tool_down, touch_height
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
 GRASP_DEPTH_M = 0.040
 # A load gripped 4 cm below its top reaches at most this far below the tcp (the tallest block is 100 mm).
 LOAD_REACH_M = 0.060
+_TOP_NOISE_M = 0.010
 # Label of the first check for a held object; one that passes here and fails later was lost on the way.
 HELD_AFTER_LIFT = "held after the lift"
 # Label of the second one; what passes here is let go into the bin next.
@@ -69,8 +69,24 @@ def grasp_height(surface_m: float, config: CellConfig) -> float:
     return max(surface_m - GRASP_DEPTH_M, config.gripper.tip_clearance_m)
 
 
-def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
+def above_grasp(grasp: Grasp, config: CellConfig) -> Array:
+    """T_base_tcp (4, 4) from which the tool comes straight down for a grasp."""
+    z = config.table.height_m + grasp_height(grasp.surface_m, config) + config.motion.approach_m
+    return tool_down(grasp.x, grasp.y, z, grasp.theta)
+
+
+def plan_grasp(
+    grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellConfig, q_above: Array | None = None
+) -> MotionPlan:
     """The motion of a grasp, from `q_start` (6,) [rad] over the bin back to the home pose.
+
+    Args:
+        grasp: that was decided.
+        heightmap: that it was decided on.
+        q_start: where the arm stands.
+        config: of the cell.
+        q_above: joint angles (6,) [rad] above the grasp, from which the tool comes straight down and to which it is
+            lifted at least; those nearest to the home pose at the approach height unless given.
 
     Raises:
         UnsafeMotion: a pose is out of reach.
@@ -78,20 +94,30 @@ def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellC
     table, use, motion = config.table.height_m, config.gripper, config.motion
     tcp_z = table + grasp_height(grasp.surface_m, config)
     approach_z = tcp_z + motion.approach_m
-    q_above = solve_tool_down("approach", tool_down(grasp.x, grasp.y, approach_z, grasp.theta), config)
+    load_m = load_reach(grasp, config)
+    touch_m = touch_height(grasp.surface_m)
+    top_z = approach_z
+    if q_above is None:
+        q_above = solve_tool_down("approach", above_grasp(grasp, config), config)
+    else:
+        top_z = float((ur5e.forward(q_above) @ rg2.T_FLANGE_TCP)[2, 3])
     # The symmetric jaw may have been turned by half a turn to stay near the home pose.
     T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
     T_near, T_grasp, T_lifted = (T_above.copy() for _ in range(3))
-    T_lifted[2, 3] = max(approach_z, table + carry_height(config))
+    T_lifted[2, 3] = max(top_z, table + carry_height(config, load_m))
+    if load_m > LOAD_REACH_M:
+        # Over where the load itself stood, which the map of clearance still shows.
+        T_lifted[2, 3] = max(T_lifted[2, 3], tcp_z + GRASP_DEPTH_M + load_m + _CARRY_CLEARANCE_M)
     T_near[2, 3] = near_height(heightmap, grasp.x, grasp.y, grasp.theta, use.preshape_m, tcp_z, config)
     T_grasp[2, 3] = tcp_z
     steps: tuple[Step, ...] = (
         Grip("pre-shape", use.preshape_m, use.force_n),
         joint_move("approach", q_above, config),
-        linear_move("descend", T_near, config),
-        guarded_move("descend guarded", T_grasp, config),
+        # It ends above all that is under the fingers; what they pass beside is the business of who decided.
+        linear_move("descend", T_near, config, touch_m=touch_m),
+        guarded_move("descend guarded", T_grasp, config, touch_m),
         Grip("close", rg2.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
-        LinearMove("lift", T_lifted, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
+        linear_move("lift", T_lifted, config, load_m, touch_m),
         CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
         *_carry(grasp, config),
     )
@@ -107,18 +133,26 @@ def plan_carry(grasp: Grasp, q_start: Array, config: CellConfig) -> MotionPlan:
     return MotionPlan("carry", q_start, _carry(grasp, config))
 
 
-def carry_height(config: CellConfig) -> float:
+def load_reach(grasp: Grasp, config: CellConfig) -> float:
+    """How far below the tcp [m] what a grasp takes reaches at most: down to the table that it stands on."""
+    reach = grasp_height(grasp.surface_m, config)
+    # The top of the tallest block is seen some millimetres too high at times.
+    return reach if reach > LOAD_REACH_M + _TOP_NOISE_M else LOAD_REACH_M
+
+
+def carry_height(config: CellConfig, load_m: float = LOAD_REACH_M) -> float:
     """Height of the tcp above the table [m] from which on a load passes over the walls of the bin."""
-    return config.bin.wall_height_m + LOAD_REACH_M + _CARRY_CLEARANCE_M
+    return config.bin.wall_height_m + load_m + _CARRY_CLEARANCE_M
 
 
 def _carry(grasp: Grasp, config: CellConfig) -> tuple[Step, ...]:
     use = config.gripper
     bin_x, bin_y = _release_point(grasp.x, grasp.y, config)
-    bin_z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M
+    load_m = load_reach(grasp, config)
+    bin_z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M + load_m - LOAD_REACH_M
     q_bin = solve_tool_down("carry to bin", tool_down(bin_x, bin_y, bin_z, 0.0), config)
     return (
-        joint_move("carry to bin", q_bin, config, load_m=LOAD_REACH_M),
+        joint_move("carry to bin", q_bin, config, load_m),
         CheckHold(HELD_OVER_BIN, use.empty_width_m),
         Grip("release", use.preshape_m, use.force_n),
         home_move(config),

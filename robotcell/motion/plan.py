@@ -27,7 +27,8 @@ class JointMove:
 class LinearMove:
     """A straight motion of the tcp to `T_base_tcp`.
 
-    With `contact_force_n` the motion is guarded: that force ends the plan with `Ending.CONTACT`.
+    With `contact_force_n` the motion is guarded: that force ends the plan with `Ending.CONTACT`. Fingers and load may
+    touch what reaches up to `touch_m` above the table [m] meanwhile; with None nothing is to be touched.
     """
 
     label: str
@@ -36,6 +37,7 @@ class LinearMove:
     acceleration_m_s2: float
     contact_force_n: float | None = None
     load_m: float = 0.0
+    touch_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -77,17 +79,20 @@ def joint_move(label: str, q: Array, config: CellConfig, load_m: float = 0.0) ->
     return JointMove(label, q, config.motion.joint_speed_rad_s, config.motion.joint_acceleration_rad_s2, load_m)
 
 
-def linear_move(label: str, T_base_tcp: Array, config: CellConfig) -> LinearMove:
+def linear_move(
+    label: str, T_base_tcp: Array, config: CellConfig, load_m: float = 0.0, touch_m: float | None = None
+) -> LinearMove:
     """A straight motion at the speed of the cell's file; see `LinearMove`."""
-    return LinearMove(label, T_base_tcp, config.motion.linear_speed_m_s, config.motion.linear_acceleration_m_s2)
+    motion = config.motion
+    speed, acceleration = motion.linear_speed_m_s, motion.linear_acceleration_m_s2
+    return LinearMove(label, T_base_tcp, speed, acceleration, load_m=load_m, touch_m=touch_m)
 
 
-def guarded_move(label: str, T_base_tcp: Array, config: CellConfig) -> LinearMove:
+def guarded_move(label: str, T_base_tcp: Array, config: CellConfig, touch_m: float) -> LinearMove:
     """A straight motion, guarded by the speed and the contact force of the cell's file; see `LinearMove`."""
     motion = config.motion
-    return LinearMove(
-        label, T_base_tcp, motion.guarded_speed_m_s, motion.linear_acceleration_m_s2, motion.contact_force_n
-    )
+    speed, acceleration = motion.guarded_speed_m_s, motion.linear_acceleration_m_s2
+    return LinearMove(label, T_base_tcp, speed, acceleration, motion.contact_force_n, touch_m=touch_m)
 
 
 def home_move(config: CellConfig, load_m: float = 0.0) -> JointMove:

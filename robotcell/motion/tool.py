@@ -10,13 +10,17 @@ import numpy as np
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform
+from robotcell.perception.clearance_map import TALLEST_BLOCK_M
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from robotcell.perception.heightmap import Heightmap
 
 # What the camera did not see may be as tall as the tallest block.
-TALLEST_OBJECT_M = 0.100
+TALLEST_OBJECT_M = TALLEST_BLOCK_M
+# Where contact is meant, fingers may touch what is up to so much higher than the tallest block, or than what is
+# grasped: the map of clearance rounds up.
+_TOUCH_MARGIN_M = 0.020
 # The gripper is taken to be this much larger all round, for what it comes down beside.
 _AROUND_M = 0.004
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
@@ -52,6 +56,22 @@ def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
         x, y, z = T_base_tcp[:3, 3]
         raise UnsafeMotion(f"{label}: the arm cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with the tool down")
     return min(solutions, key=lambda q: float(np.abs(q - home).max()))
+
+
+def tool_down_solutions(T_base_tcp: Array, config: CellConfig) -> list[Array]:
+    """All joint angles (6,) [rad] for a pose as in `solve_tool_down`, those nearest to the home pose first.
+
+    They differ in the turns of the wrist, in where the elbow is and to which side the shoulder turns.
+    """
+    home = np.array(config.motion.home_q)
+    poses = (T_base_tcp, T_base_tcp @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    solutions = np.concatenate([ur5e.inverse_all(flange_pose(T), home) for T in poses])
+    return sorted(solutions, key=lambda q: float(np.abs(q - home).max()))
+
+
+def touch_height(top_m: float) -> float:
+    """Height above the table [m] up to which things may be touched where something with that top is meant."""
+    return max(TALLEST_OBJECT_M, top_m) + _TOUCH_MARGIN_M
 
 
 def near_height(

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.surroundings import bin_box
 from robotcell.errors import CalibrationError, DeviceFault
 from robotcell.geometry.bodies import blocks_view
 from robotcell.perception.calibrated_camera import CalibratedCamera
+from robotcell.perception.clearance_map import ClearanceMap, build_clearance_map
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 from robotcell.perception.segmentation import Segmentation, segment
 from robotcell.perception.tags import check_tags
@@ -28,12 +30,14 @@ class View:
         camera: that took it, as its calibration has it.
         heightmap: built from both.
         segmentation: of the heightmap.
+        clearance: up to which height something may stand, wherever the camera looks.
     """
 
     frame: RgbdFrame
     camera: CalibratedCamera
     heightmap: Heightmap
     segmentation: Segmentation
+    clearance: ClearanceMap
 
 
 def look(devices: Devices, config: CellConfig, workspace: Workspace | None = None) -> View:
@@ -73,7 +77,8 @@ def view_of(frame: RgbdFrame, config: CellConfig, workspace: Workspace) -> View:
     """What a frame shows, of now or of a recorded look, on the map of a workspace; nothing is checked."""
     camera = CalibratedCamera.of(config.camera)
     heightmap = build_heightmap(frame, camera, workspace, config.table.height_m)
-    return View(frame, camera, heightmap, segment(heightmap))
+    clearance = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),))
+    return View(frame, camera, heightmap, segment(heightmap), clearance)
 
 
 def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:

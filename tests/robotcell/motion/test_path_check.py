@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotcell.config import CellConfig
@@ -57,6 +57,7 @@ def state(**changes: Any) -> ArmState:
     return replace(measured, **changes)
 
 
+@settings(max_examples=50)
 @given(
     st.sampled_from(KINDS),
     st.floats(CONFIG.workspace.x[0], CONFIG.workspace.x[1]),

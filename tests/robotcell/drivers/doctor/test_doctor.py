@@ -17,6 +17,7 @@ from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.robotcell.drivers.served_cell import CAMERA_PORT, HOST, MODBUS_PORT
 from tests.robotcell.drivers.ur5e.served_arm import fault, joints, make_arm, wait_until
 
@@ -62,7 +63,7 @@ def wrong(findings: list[Finding]) -> list[Finding]:
 
 def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "absent.toml"
-    path.write_text(cell_text("127.0.0.49"))
+    path.write_text(cell_text(loopback(49)))
     begin = time.monotonic()
     result = CliRunner().invoke(app, ["doctor", "--cell", str(path), "--json", "--seconds", "0.5"])
     assert time.monotonic() - begin < 10.0
@@ -73,12 +74,12 @@ def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> 
     assert set(absent) == {"arm", "gripper", "camera"}
     assert "check that the controller has booted" in absent["arm"]
     assert "check the Compute Box's power" in absent["gripper"]
-    assert "127.0.0.49" in absent["camera"]
+    assert loopback(49) in absent["camera"]
 
 
 def test_a_usb_camera_needs_its_rule_and_is_looked_for(tmp_path: Path) -> None:
     path = tmp_path / "usb.toml"
-    path.write_text(cell_text("127.0.0.49").replace(f"twin://127.0.0.49:{CAMERA_PORT}", "usb"))
+    path.write_text(cell_text(loopback(49)).replace(f"twin://{loopback(49)}:{CAMERA_PORT}", "usb"))
     findings = examine(load_config(path), SECONDS)
     assert any(finding.what == "udev rule" for finding in findings)
     assert any(finding.device == "camera" and "no RealSense" in finding.cure for finding in wrong(findings))
