@@ -69,6 +69,8 @@ def run_resume(job_id: int | None, cell: CellChoice, *, as_json: bool) -> int:
     try:
         config = cell.load()
         check_config(config)
+        if config.journal.url is None and not config.journal.default_file.exists():
+            raise ConfigError(f"there is no journal {config.journal.default_file}: start a job with robotcell pick")
         with Journal(config.journal.database_url()) as journal:
             job = _last_job(journal, config) if job_id is None else journal.job(job_id)
         config = config.model_copy(update={"policy": config.policy.model_copy(update={"name": job.policy})})

@@ -209,7 +209,9 @@ class TwinArm(Arm):
     def _need_ready(self) -> None:
         self._need_connection()
         if self._mode is not ArmMode.READY:
-            raise DeviceFault(f"the arm is in {self._mode.value}: look at the cell, clear the contact, then recover")
+            raise DeviceFault(
+                f"the arm is in {self._mode.value}: look at the cell, clear the contact, then run robotcell recover"
+            )
         if self.moving:
             raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it")
 

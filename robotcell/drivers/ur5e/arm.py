@@ -234,7 +234,8 @@ class UR5e(Arm):
         while _mode(self._record()) is ArmMode.PROTECTIVE_STOP:
             if time.monotonic() > deadline:
                 raise DeviceFault(
-                    "the protective stop came back at once: free the arm with freedrive at the pendant, then recover",
+                    "the protective stop came back at once: free the arm with freedrive at the pendant, then run "
+                    "robotcell recover",
                     device="arm",
                 )
             self._clock.sleep(_POLL_S)
