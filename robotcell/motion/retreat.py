@@ -17,8 +17,6 @@ from robotcell.motion.tool import touch_height
 from robotcell.motion.way import led_around
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from robotcell.config import CellConfig
     from robotcell.interfaces import ArmState
     from robotcell.motion.path_check import CheckedPlan
@@ -59,7 +57,12 @@ def check_retreat(state: ArmState, config: CellConfig, seen: ClearanceMap | None
             return check_path(plan, config, seen)
         except Obstructed:
             return check_path(led_around(plan, seen, config), config, seen)
-    return _from_as_high_as_possible(lambda up_m: plan_retreat(state, config, up_m), config)
+    for up_m in np.arange(config.limits.z[1], _lowest_rise(config), -_RISE_STEP_M):
+        try:
+            return check_path(plan_retreat(state, config, float(up_m)), config)
+        except UnsafeMotion:
+            continue
+    return check_path(plan_retreat(state, config), config)
 
 
 def plan_retreat(state: ArmState, config: CellConfig, up_m: float = 0.0) -> MotionPlan:
@@ -86,38 +89,13 @@ def _lowest_rise(config: CellConfig) -> float:
     return config.motion.approach_m + GRASP_DEPTH_M
 
 
-def _from_as_high_as_possible(plan_of: Callable[[float], MotionPlan], config: CellConfig) -> CheckedPlan:
-    """The plan that goes up highest, of those that are safe; `plan_of` makes it of a height above the table [m]."""
-    for up_m in np.arange(config.limits.z[1], _lowest_rise(config), -_RISE_STEP_M):
-        try:
-            return check_path(plan_of(float(up_m)), config)
-        except UnsafeMotion:
-            continue
-    return check_path(plan_of(0.0), config)
-
-
-def check_recovery(state: ArmState, config: CellConfig) -> CheckedPlan:
-    """The way home after a stop, from wherever the arm stands; nobody looked, so it goes up as high as it can first.
-
-    Raises:
-        UnsafeMotion: the way is not safe.
-    """
-    return _from_as_high_as_possible(lambda up_m: plan_recovery(state, config, up_m), config)
-
-
-def plan_recovery(state: ArmState, config: CellConfig, up_m: float = 0.0) -> MotionPlan:
-    """Straight up and home, slowly, the fingers as they are, so that nothing falls; no step for an arm at home.
-
-    Args:
-        state: of the arm, as measured.
-        config: of the cell.
-        up_m: height above the table to go up to, if it is higher than a load needs [m].
-    """
+def plan_recovery(state: ArmState, config: CellConfig) -> MotionPlan:
+    """Straight up and home, slowly, the fingers as they are, so that nothing falls; no step for an arm at home."""
     if at_home(state, config):
         return MotionPlan("recovery", state.q, ())
     home = home_move(config, LOAD_REACH_M)
     slow = replace(home, speed_rad_s=min(SLOW_RAD_S, home.speed_rad_s))
-    return MotionPlan("recovery", state.q, (*_slowly(_rise(state, config, up_m)), slow))
+    return MotionPlan("recovery", state.q, (*_slowly(_rise(state, config)), slow))
 
 
 def plan_feel(state: ArmState, config: CellConfig) -> MotionPlan:
@@ -126,9 +104,9 @@ def plan_feel(state: ArmState, config: CellConfig) -> MotionPlan:
     return MotionPlan("feel what is held", state.q, (*_rise(state, config), feel))
 
 
-def _rise(state: ArmState, config: CellConfig, up_m: float = 0.0) -> tuple[LinearMove, ...]:
-    """Straight up until a load would pass over the walls of the bin, or higher."""
-    clear_z = config.table.height_m + max(up_m, carry_height(config))
+def _rise(state: ArmState, config: CellConfig) -> tuple[LinearMove, ...]:
+    """Straight up until a load would pass over the walls of the bin."""
+    clear_z = config.table.height_m + carry_height(config)
     if state.T_base_tcp[2, 3] >= clear_z:
         return ()
     T_up = state.T_base_tcp.copy()
