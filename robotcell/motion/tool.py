@@ -38,13 +38,16 @@ def flange_pose(T_base_tcp: Array) -> Array:
     return T_base_tcp @ invert_transform(rg2.T_FLANGE_TCP)
 
 
-def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
-    """Joint angles (6,) [rad] nearest to the home pose; the jaw is symmetric, so half a turn about its axis is as good.
+def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig, q_from: Array | None = None) -> Array:
+    """Joint angles (6,) [rad] in the posture of the home pose.
+
+    The jaw is symmetric, so half a turn about its axis is as good.
 
     Args:
         label: of the step, for the error.
         T_base_tcp: pose (4, 4) of a tool that points down.
         config: of the cell.
+        q_from: joint angles (6,) from which the leading joint is to have the shortest way; the home pose unless given.
 
     Raises:
         UnsafeMotion: the arm cannot reach the pose.
@@ -55,7 +58,8 @@ def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
     if not solutions:
         x, y, z = T_base_tcp[:3, 3]
         raise UnsafeMotion(f"{label}: the arm cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with the tool down")
-    return min(solutions, key=lambda q: float(np.abs(q - home).max()))
+    near = home if q_from is None else q_from
+    return min(solutions, key=lambda q: float(np.abs(q - near).max()))
 
 
 def tool_down_solutions(T_base_tcp: Array, config: CellConfig) -> list[Array]:

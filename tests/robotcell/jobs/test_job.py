@@ -127,9 +127,10 @@ def test_what_was_decided_and_felt_is_in_the_journal(config: CellConfig) -> None
     assert (grasp.primitive, grasp.surface_m, grasp.end_x) == ("grasp", 0.05, None)
     for row in (push, grasp):
         assert row.outcome is not None
-        # The fingers moved in both, and what they pressed with is known, though nothing ended the plan.
-        assert row.outcome.grip_force_n is not None
+        # What was felt is known, though nothing ended the plan. A push closes the fingers in free air.
         assert row.outcome.peak_force_n is not None
+    assert push.outcome is not None
+    assert push.outcome.grip_force_n is None
     assert grasp.outcome is not None
     assert 0 < (grasp.outcome.grip_force_n or 0) < config.motion.closing_force_n
 
