@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.config import find_backend
-from robotcell.errors import ConnectionLost, DeviceFault
+from robotcell.config.fingers import finger_problems
+from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
 from robotcell.motion.executor import Execution, Executor
 from robotcell.motion.guard import Latch
 from robotcell.motion.path_check import check_path
@@ -165,7 +166,8 @@ class Cell:
         Raises:
             ConnectionLost, DeviceFault: the failure of the one device that failed, or all of them together
                 (as DeviceFault if every device could be reached).
-            ConfigError: a backend finds its own settings wrong, at the first device.
+            ConfigError: a backend finds its own settings wrong, at the first device; or the mounted finger tips cannot
+                reach what the cell's file asks of them.
         """
         failures: list[tuple[str, ConnectionLost | DeviceFault]] = []
         try:
@@ -177,6 +179,8 @@ class Cell:
         except BaseException:
             self.close()
             raise
+        if not failures:
+            self._check_fingers()
         if failures:
             self.close()
             if len(failures) == 1:
@@ -184,6 +188,16 @@ class Cell:
             kind = ConnectionLost if any(isinstance(e, ConnectionLost) for _, e in failures) else DeviceFault
             raise kind("\n  ".join(["the cell cannot be opened:", *(f"{name}: {error}" for name, error in failures)]))
         return self
+
+    def _check_fingers(self) -> None:
+        try:
+            problems = finger_problems(self.config, self.gripper.range())
+        except BaseException:
+            self.close()
+            raise
+        if problems:
+            self.close()
+            raise ConfigError("\n  ".join(["the cell cannot be opened:", *problems]))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -74,6 +74,25 @@ class GripperState:
 
 
 @dataclass(frozen=True)
+class GripperRange:
+    """What a gripper can do with the finger tips that are mounted on it.
+
+    Attributes:
+        fingertip_offset_m: how far each tip reaches inwards from the bare finger, outwards where negative.
+        min_width_m: between the tips of the fingers when they are closed as far as they go.
+        max_width_m: the same when they are wide open.
+        min_force_n: of a grip.
+        max_force_n: of a grip.
+    """
+
+    fingertip_offset_m: float
+    min_width_m: float
+    max_width_m: float
+    min_force_n: float
+    max_force_n: float
+
+
+@dataclass(frozen=True)
 class Intrinsics:
     """Pinhole model of an undistorted image: u = fx x / z + cx, v = fy y / z + cy [px]."""
 
@@ -198,6 +217,10 @@ class Gripper(Device, Protocol):
 
     def state(self) -> GripperState:
         """The newest measurement."""
+        ...
+
+    def range(self) -> GripperRange:
+        """What it can reach, with the finger tips that it has."""
         ...
 
     def start_width(self, width_m: float, force_n: float) -> None:

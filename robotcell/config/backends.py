@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,11 +12,11 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from robotcell.config.schema import CellConfig
-    from robotcell.interfaces import Devices
+    from robotcell.interfaces import Devices, GripperRange
 
 
 class Backend(Protocol):
-    """An entry point of the group `robotcell.backends`: a class with these two members."""
+    """An entry point of the group `robotcell.backends`: a class with these three members."""
 
     Options: type[BaseModel]
 
@@ -24,7 +25,13 @@ class Backend(Protocol):
         """The devices of a cell, not yet connected; `config.backend.options` fits `Options`."""
         ...
 
+    @staticmethod
+    def gripper_range(config: CellConfig) -> GripperRange:
+        """What the gripper of a cell can reach, by its options alone; its device reports the same once connected."""
+        ...
 
+
+@lru_cache
 def find_backend(name: str) -> Backend:
     """The backend of that name.
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from robotcell.config.fingers import gripper_range
 from robotcell.errors import StorageError
 from robotcell.geometry import rg2
 from robotcell.io.images import write_image
@@ -192,9 +193,10 @@ def _draw_fingers(panel: _Picture, grasp: Grasp, config: CellConfig, pixel: _ToP
     along = np.array([np.cos(grasp.theta), np.sin(grasp.theta)])
     across = np.array([-along[1], along[0]]) * rg2.FINGER_BREADTH_M / 2
     inner = config.gripper.preshape_m / 2
+    thickness = rg2.finger_thickness(gripper_range(config).fingertip_offset_m)
     for side in (-1, 1):
         near = np.array([x, y]) + side * inner * along
-        far = near + side * rg2.FINGER_THICKNESS_M * along
+        far = near + side * thickness * along
         corners = [pixel(*p) for p in (near - across, near + across, far + across, far - across)]
         cv2.fillPoly(panel, [np.array(corners)], _ACTION, cv2.LINE_AA)
         cv2.line(panel, pixel(x, y), pixel(*near), _ACTION, 2, cv2.LINE_AA)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import finger_problems, gripper_range
 from robotcell.config.surroundings import obstacles
 from robotcell.errors import ConfigError, UnsafeMotion
 from robotcell.geometry import ur5e
@@ -26,10 +27,11 @@ def check_config(config: CellConfig) -> None:
     """Check that the parts of a configuration fit each other.
 
     Raises:
-        ConfigError: naming everything that does not: speeds over their limits, a home pose that is unsafe or in the
-            view of the camera, a workspace or a bin that the arm may not or cannot reach.
+        ConfigError: naming everything that does not: speeds over their limits, a pre-shape that the mounted finger tips
+            cannot reach, a home pose that is unsafe or in the view of the camera, a workspace or a bin that the arm may
+            not or cannot reach.
     """
-    problems: list[str] = []
+    problems = finger_problems(config, gripper_range(config))
     motion, limits = config.motion, config.limits
     if motion.joint_speed_rad_s > limits.joint_speed_rad_s:
         problems.append(

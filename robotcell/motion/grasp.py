@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from robotcell.config.fingers import closed_width, narrowest_hold
 from robotcell.geometry import rg2, ur5e
 from robotcell.motion.plan import (
     CheckHold,
@@ -74,6 +75,7 @@ def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellC
         UnsafeMotion: a pose is out of reach.
     """
     table, use, motion = config.table.height_m, config.gripper, config.motion
+    holds_m = narrowest_hold(config)
     tcp_z = table + grasp_height(grasp.surface_m, config)
     approach_z = tcp_z + motion.approach_m
     q_above = solve_tool_down("approach", tool_down(grasp.x, grasp.y, approach_z, grasp.theta), config)
@@ -91,11 +93,11 @@ def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellC
         joint_move("approach", q_above, config),
         linear_move("descend", T_near, config),
         guarded_move("descend guarded", T_grasp, config),
-        Grip("close", rg2.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
+        Grip("close", closed_width(config), use.force_n, motion.closing_force_n),
         LinearMove("lift", T_lifted, motion.linear_speed_m_s, motion.linear_acceleration_m_s2, load_m=LOAD_REACH_M),
-        CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
+        CheckHold(HELD_AFTER_LIFT, holds_m),
         joint_move("carry to bin", q_bin, config, load_m=LOAD_REACH_M),
-        CheckHold("held over the bin", use.empty_width_m),
+        CheckHold("held over the bin", holds_m),
         Grip("release", use.preshape_m, use.force_n),
         home_move(config),
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.config.fingers import gripper_range, with_tips
 from robotcell.config.surroundings import obstacles
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, rg2, ur5e
@@ -20,6 +21,7 @@ from robotcell.motion.tool import flange_pose
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig, KeepOut
+    from robotcell.interfaces import GripperRange
 
 # Distance between the samples of a checked path. A joint step of 0.04 rad moves the outstretched tcp by 40 mm.
 _JOINT_STEP_RAD = 0.04
@@ -73,7 +75,7 @@ def check_path(plan: MotionPlan, config: CellConfig, *, lowest_tip_m: float | No
         name = f"{plan.label}, step {step.label!r}"
         path = q[None]
         if isinstance(step, Grip):
-            _check_grip(step, name)
+            _check_grip(step, gripper_range(config), name)
         elif isinstance(step, JointMove | LinearMove):
             path = (
                 joint_path(q, step, config, name)
@@ -104,11 +106,17 @@ def outside_box(points: Array, config: CellConfig, slack_m: float, lowest_m: flo
     return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))
 
 
-def _check_grip(step: Grip, name: str) -> None:
-    if not rg2.MIN_WIDTH_M <= step.width_m <= rg2.MAX_WIDTH_M:
-        raise UnsafeMotion(f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's 0 to 110 mm")
-    if not rg2.MIN_FORCE_N <= step.force_n <= rg2.MAX_FORCE_N:
-        raise UnsafeMotion(f"{name}: force {step.force_n:.1f} N is outside the gripper's 3 to 40 N")
+def _check_grip(step: Grip, reach: GripperRange, name: str) -> None:
+    if not reach.min_width_m - _ROUNDING_M <= step.width_m <= reach.max_width_m + _ROUNDING_M:
+        raise UnsafeMotion(
+            f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's {1000 * reach.min_width_m:.0f} to "
+            f"{1000 * reach.max_width_m:.0f} mm{with_tips(reach)}"
+        )
+    if not reach.min_force_n <= step.force_n <= reach.max_force_n:
+        raise UnsafeMotion(
+            f"{name}: force {step.force_n:.1f} N is outside the gripper's {reach.min_force_n:.0f} to "
+            f"{reach.max_force_n:.0f} N"
+        )
 
 
 def _joint_vector(q: Array, name: str) -> Array:

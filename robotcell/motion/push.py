@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from robotcell.config.fingers import closed_width
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.motion.plan import Grip, MotionPlan, Step, guarded_move, home_move, joint_move, linear_move
@@ -95,12 +96,12 @@ def plan_push(push: Push, heightmap: Heightmap, q_start: Array, config: CellConf
     q_above = solve_tool_down("approach", tool_down(x, y, approach_z, push.theta), config)
     T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
     T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
-    T_near[2, 3] = near_height(heightmap, x, y, push.theta, rg2.MIN_WIDTH_M, tcp_z, config)
+    T_near[2, 3] = near_height(heightmap, x, y, push.theta, closed_width(config), tcp_z, config)
     T_start[2, 3] = tcp_z
     T_end[:3, 3] = (end_x, end_y, tcp_z)
     T_up[:3, 3] = (end_x, end_y, approach_z)
     steps: tuple[Step, ...] = (
-        Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
+        Grip("close", closed_width(config), config.gripper.force_n),
         joint_move("approach", q_above, config),
         linear_move("descend", T_near, config),
         guarded_move("descend guarded", T_start, config),

@@ -41,7 +41,7 @@ def examine(config: CellConfig, seconds: float) -> list[Finding]:
     rounds: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
         ("computer", lambda: examine_computer(options.camera.source)),
         ("arm", lambda: examine_arm(options.arm, seconds, config.limits.state_age_s)),
-        ("gripper", lambda: examine_gripper(options.gripper, seconds)),
+        ("gripper", lambda: examine_gripper(options.gripper, config, seconds)),
         ("camera", lambda: examine_camera(options.camera, config.camera, seconds)),
         ("calibration", lambda: examine_calibration(config.camera)),
     ]

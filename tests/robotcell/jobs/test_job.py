@@ -138,6 +138,16 @@ def test_a_policy_sees_the_map_that_it_declares_and_people_the_one_of_the_file(c
     assert policy.seen[0].heightmap.workspace.resolution_m == 0.003
 
 
+@pytest.mark.parametrize(("offset", "preshape"), [(0.02, 0.07), (-0.005, 0.08)])
+def test_fingers_with_other_tips_pick(config: CellConfig, offset: float, preshape: float) -> None:
+    config.backend.options["fingertip_offset_m"] = offset
+    config = config.model_copy(update={"gripper": config.gripper.model_copy(update={"preshape_m": preshape})})
+    policy = Scripted([grasp_at(-0.4, 0.0), grasp_at(*RED)])
+    report, results, _ = run(config, policy, ("red",))
+    # Fingers that close on nothing know it, however far apart their tips then are.
+    assert results == [Result.MISSED, Result.PICKED], report.reason
+
+
 def test_a_wrong_object_counts_as_wrong(config: CellConfig) -> None:
     report, results, _ = run(config, Scripted([grasp_at(*BLUE)]), ("red",))
     assert results == [Result.WRONG_OBJECT]
