@@ -10,9 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from cli.console import error_as_json, print_json, progress, report_error, results
+from cli.findings import print_findings
 from policy import make_policy
 from robotcell.cell import open_cell
 from robotcell.errors import CellError, ConfigError, NoTarget
+from robotcell.findings import Grade
 from robotcell.io.images import write_image
 from robotcell.jobs.job import Report, preview, run_job
 from robotcell.jobs.journal import Journal
@@ -23,6 +25,7 @@ from robotcell.motion.grasp import Grasp
 from robotcell.perception.goals import goal_color
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
 
     from cli.options import CellChoice
     from robotcell.config import CellConfig
+    from robotcell.findings import Finding
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
@@ -154,6 +158,13 @@ class _Progress:
         self.job = job_id, run_dir
         self._console.print(Text(f"job {job_id}, {run_dir}"), soft_wrap=True)
         self._status.update("looking")
+
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """Print what the preflight found that could be better; what refuses the job is the error that ends it."""
+        notes = [finding for finding in findings if finding.grade is Grade.NOTE]
+        self._console.print(Text(f"preflight: {len(findings)} findings, {len(notes)} of them notes"))
+        if notes:
+            print_findings(notes, self._console)
 
     def looked(self, view: View) -> None:
         """Show what is on the table."""

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from robotcell.findings import Finding
+
 Array: TypeAlias = npt.NDArray[np.float64]
 
 # A motion that is not kicked for so long [s] stops, on every backend. Chosen: 25 periods of the executor, so that a
@@ -181,6 +183,14 @@ class Arm(Device, Protocol):
 
     def state(self) -> ArmState:
         """The newest measurement."""
+        ...
+
+    def report(self) -> tuple[Finding, ...]:
+        """What the arm says of its own settings that a motion depends on; nothing where it cannot be asked.
+
+        Payload and tool centre point as they are read back, remote control, speed slider. Takes some tens of
+        milliseconds, and is asked before a job.
+        """
         ...
 
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:

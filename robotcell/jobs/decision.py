@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
+    from robotcell.findings import Finding
     from robotcell.jobs.policy_api import Task
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
@@ -38,6 +40,10 @@ class Observer(Protocol):
 
     def started(self, job_id: int, run_dir: Path) -> None:
         """The job is in the journal and its folder is made."""
+        ...
+
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """The preflight is over; a job that it refuses ends now."""
         ...
 
     def looked(self, view: View) -> None:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.errors import CellError, NoTarget, UnsafeMotion
+from robotcell.errors import CellError, NoTarget, StorageError, UnsafeMotion
 from robotcell.jobs.decision import Decision, Observer
 from robotcell.jobs.hidden_goal import place_after, uncover
 from robotcell.jobs.journal_tables import action_row, frame_row, outcome_row
 from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
+from robotcell.jobs.preflight import preflight
 from robotcell.jobs.run_folder import make_run_dir, save_frame
 from robotcell.jobs.verdict import SCENE_CHANGED, Outcome, Result, judge
 from robotcell.motion.actions import plan_action
@@ -85,21 +86,35 @@ def run_job(
 
     Raises:
         ConfigError: the configuration does not fit together.
+        CellError: the preflight found something wrong, and nothing moved; the journal has the job as refused, and
+            `preflight.json` in its folder all findings.
         StorageError: the folder of the run, an image or the journal cannot be written.
         DeviceFault, ConnectionLost, GuardTripped, CalibrationError, UnsafeMotion: the cell was stopped. The journal
             has it; after a motion was cut short, the cell's latch holds until `Cell.recover`.
     """
     check_config(cell.config)
-    run_dir = make_run_dir(cell.config.journal.runs, "-".join(goals) if goals else "all")
+    checked = preflight(cell, journal, policy.workspace)
+    refusal = checked.refusal()
     started = cell.clock.now()
     status, reason = "stopped", ""
     # A database URL may hold a password.
     settings = cell.config.model_dump(mode="json", exclude={"journal": {"url"}})
-    job_id = journal.start_job(goals, policy.name, settings, run_dir)
+    try:
+        run_dir = make_run_dir(cell.config.journal.runs, "-".join(goals) if goals else "all")
+        checked.save(run_dir)
+        job_id = journal.start_job(goals, policy.name, settings, run_dir)
+    except StorageError as error:
+        # What the preflight found says this too, and whatever else is wrong.
+        raise refusal or error from None
     try:
         for observer in observers:
             observer.started(job_id, run_dir)
-        job = _Job(cell, policy, journal, observers, job_id, run_dir)
+        for observer in observers:
+            observer.checked(checked.findings)
+        if refusal is not None:
+            status = "refused"
+            raise refusal
+        job = _Job(cell, policy, journal, observers, job_id, run_dir, checked.view)
         reason = job.pick_in_order(goals) if goals else job.pick_all()
         status = "incomplete" if reason else "complete"
     except BaseException as error:
@@ -119,6 +134,8 @@ class _Job:
     observers: tuple[Observer, ...]
     job_id: int
     run_dir: Path
+    # What the preflight saw, to begin with.
+    view: View | None = None
     actions: int = 0
 
     def pick_in_order(self, goals: tuple[str, ...]) -> str:
@@ -140,10 +157,14 @@ class _Job:
         off = np.abs(self.cell.arm.state().q - np.array(self.cell.config.motion.home_q)).max()
         if off > _AT_HOME_RAD:
             self.cell.home()
+        elif self.view is not None:
+            return self._show(self.view)
         return self._look()
 
     def _look(self) -> View:
-        view = self.cell.look(self.policy.workspace)
+        return self._show(self.cell.look(self.policy.workspace))
+
+    def _show(self, view: View) -> View:
         for observer in self.observers:
             observer.looked(view)
         return view

@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import create_engine, event, func, select
+from sqlalchemy import create_engine, event, func, select, update
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session
@@ -91,6 +91,15 @@ class Journal:
     def close(self) -> None:
         """Release the database; idempotent."""
         self._engine.dispose()
+
+    def check_writable(self) -> None:
+        """See whether the database takes a row, without leaving one.
+
+        Raises:
+            StorageError: it does not.
+        """
+        with self._writing() as session:
+            session.execute(update(Job).where(Job.id == -1).values(reason=""))
 
     def start_job(self, goals: Sequence[str] | None, policy: str, config: dict[str, Any], run_dir: Path) -> int:
         """Record that a job starts; returns its id."""

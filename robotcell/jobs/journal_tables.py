@@ -49,7 +49,7 @@ class Job(Base):
     config: Mapped[dict[str, Any]] = mapped_column(JSON)
     # Folder of the run.
     run_dir: Mapped[str]
-    # running, complete, incomplete or stopped.
+    # running, complete, incomplete, stopped, or refused (before it began: what was wrong is the reason).
     status: Mapped[str] = mapped_column(default="running")
     # Why it is not complete.
     reason: Mapped[str] = mapped_column(default="")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import cv2
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from robotcell.config import CellConfig
+    from robotcell.findings import Finding
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
@@ -56,6 +57,9 @@ class JobPictures:
     def started(self, job_id: int, run_dir: Path) -> None:
         """Take the folder of the run."""
         self._folder = run_dir
+
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """There is nothing to draw yet."""
 
     def looked(self, view: View) -> None:
         """Keep the newest view for the last page."""

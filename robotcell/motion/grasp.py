@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 from robotcell.config.fingers import closed_width, narrowest_hold
@@ -102,6 +103,12 @@ def plan_grasp(grasp: Grasp, heightmap: Heightmap, q_start: Array, config: CellC
         home_move(config),
     )
     return MotionPlan("grasp", q_start, steps)
+
+
+def release_corners(config: CellConfig) -> tuple[tuple[float, float, float], ...]:
+    """Where (x, y, z) [m] the tcp goes over the bin: the farthest points at which a grasp lets go."""
+    z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M
+    return tuple((*_release_point(x, y, config), z) for x, y in product(config.workspace.x, config.workspace.y))
 
 
 def _release_point(x: float, y: float, config: CellConfig) -> tuple[float, float]:

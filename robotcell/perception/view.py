@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.errors import CalibrationError, DeviceFault
+from robotcell.errors import CalibrationError, CellError, DeviceFault
 from robotcell.geometry.bodies import blocks_view
 from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.heightmap import Heightmap, build_heightmap
@@ -15,6 +15,8 @@ from robotcell.perception.segmentation import Segmentation, segment
 from robotcell.perception.tags import check_tags
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from robotcell.config import CellConfig, Workspace
     from robotcell.interfaces import Devices, RgbdFrame
 
@@ -49,31 +51,65 @@ def look(devices: Devices, config: CellConfig, workspace: Workspace | None = Non
         CalibrationError: the table is not where the configuration has it, a fixed tag not where it was, or the
             calibration is of another resolution.
     """
-    limits, workspace = config.limits, workspace or config.workspace
-    camera = CalibratedCamera.of(config.camera)
-    if blocks_view(devices.arm.state().q, camera.position, workspace.x, workspace.y, config.table.height_m):
+    workspace = workspace or config.workspace
+    if arm_in_view(devices, config, workspace):
         raise DeviceFault(
             "the arm stands between the camera and the workspace: move it to the home pose, then look", device="arm"
         )
-    frame = devices.camera.read()
+    view, problems = see(fresh_frame(devices, config), config, workspace)
+    if problems:
+        raise problems[0]
+    return view
+
+
+def arm_in_view(devices: Devices, config: CellConfig, workspace: Workspace) -> bool:
+    """Whether the arm stands between the camera and a workspace.
+
+    Raises:
+        ConnectionLost: the arm cannot be asked.
+    """
+    eye = CalibratedCamera.of(config.camera).position
+    return blocks_view(devices.arm.state().q, eye, workspace.x, workspace.y, config.table.height_m)
+
+
+def fresh_frame(devices: Devices, config: CellConfig) -> RgbdFrame:
+    """A frame of the camera.
+
+    Raises:
+        ConnectionLost, DeviceFault: there is none, or it is older than `limits.frame_age_s`.
+    """
+    frame, limit = devices.camera.read(), config.limits.frame_age_s
     age = devices.clock.now() - frame.t
-    if age > limits.frame_age_s:
+    if age > limit:
         raise DeviceFault(
-            f"frame {frame.number} is {age:.2f} s old (limit {limits.frame_age_s} s): check the camera", device="camera"
+            f"frame {frame.number} is {age:.2f} s old (limit {limit} s): check the camera", device="camera"
         )
-    if config.camera.measured is not None:
-        check_tags(frame.color, config.camera.measured.tags)
+    return frame
+
+
+def see(frame: RgbdFrame, config: CellConfig, workspace: Workspace) -> tuple[View, list[CellError]]:
+    """What a frame shows, and everything that makes it unfit to act on.
+
+    Raises:
+        CalibrationError: the calibration is of another resolution.
+    """
+    camera, problems = CalibratedCamera.of(config.camera), list[CellError]()
     heightmap = build_heightmap(frame, camera, workspace, config.table.height_m)
-    _check_coverage(heightmap, limits.min_coverage)
-    _check_table(heightmap, config)
-    return View(frame, camera, heightmap, segment(heightmap))
+    try:
+        if config.camera.measured is not None:
+            check_tags(frame.color, config.camera.measured.tags)
+    except CalibrationError as error:
+        problems.append(error)
+    problems += _coverage_problems(heightmap, config.limits.min_coverage)
+    problems += _table_problems(heightmap, config)
+    return View(frame, camera, heightmap, segment(heightmap)), problems
 
 
-def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:
+def _coverage_problems(heightmap: Heightmap, min_coverage: float) -> Iterator[CellError]:
     # Without the gaps between pixels, which say something of the resolution and nothing of the view.
     coverage = float(np.isfinite(heightmap.closed_m).mean())
     if coverage < min_coverage:
-        raise DeviceFault(
+        yield DeviceFault(
             f"the camera sees {coverage:.0%} of the workspace (limit {min_coverage:.0%}): check its view, its "
             f"lens and the light; cells finer than its pixels (here {1000 * heightmap.workspace.resolution_m:g} mm) "
             "stay empty too",
@@ -81,12 +117,12 @@ def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:
         )
 
 
-def _check_table(heightmap: Heightmap, config: CellConfig) -> None:
+def _table_problems(heightmap: Heightmap, config: CellConfig) -> Iterator[CellError]:
     table, limits = heightmap.table, config.limits
     if table is None:
-        raise CalibrationError("too little of the table is seen to tell where it is: clear a part of the workspace")
-    if table.tilt_rad > limits.max_tilt_rad or abs(table.offset_m) > limits.max_table_offset_m:
-        raise CalibrationError(
+        yield CalibrationError("too little of the table is seen to tell where it is: clear a part of the workspace")
+    elif table.tilt_rad > limits.max_tilt_rad or abs(table.offset_m) > limits.max_table_offset_m:
+        yield CalibrationError(
             f"the table appears tilted by {np.degrees(table.tilt_rad):.2f} degrees and {1000 * table.offset_m:+.1f} mm "
             f"off (limits {np.degrees(limits.max_tilt_rad):.2f} degrees, {1000 * limits.max_table_offset_m:.1f} mm): "
             "check table.height_m and the camera's pose, calibrate again if it was moved"

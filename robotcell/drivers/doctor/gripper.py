@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from robotcell.config.fingers import finger_problems, with_tips
 from robotcell.drivers.clock import WallClock
-from robotcell.drivers.doctor.findings import Finding, Grade, milliseconds
+from robotcell.drivers.doctor.timing import milliseconds
 from robotcell.drivers.rg2 import RG2
+from robotcell.findings import Finding, Grade
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

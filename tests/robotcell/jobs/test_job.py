@@ -25,9 +25,10 @@ from robotcell.perception.colors import PALETTE
 from robotcell.perception.goals import find_goal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from robotcell.findings import Finding
     from robotcell.interfaces import Camera, Gripper, GripperState, RgbdFrame
     from robotcell.jobs.decision import Decision
     from robotcell.perception.view import View
@@ -92,6 +93,8 @@ def run(
 
     class Collector:
         def started(self, job_id: int, run_dir: Path) -> None: ...
+
+        def checked(self, findings: Sequence[Finding]) -> None: ...
 
         def looked(self, view: View) -> None: ...
 

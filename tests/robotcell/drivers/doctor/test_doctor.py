@@ -14,8 +14,8 @@ from cli.main import app
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import examine
-from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
+from robotcell.findings import Finding, Grade
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
 from tests.robotcell.drivers.served_cell import CAMERA_PORT, HOST, MODBUS_PORT
