@@ -14,6 +14,7 @@ from robotcell.motion.executor import Execution, Executor
 from robotcell.motion.guard import Latch
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.recorder import Recorder
 from robotcell.motion.retreat import plan_retreat
 from robotcell.perception.view import View, look
 
@@ -36,11 +37,16 @@ class Cell:
         config: of the cell.
         devices: arm, gripper, camera and clock.
         latch: remembers a safety stop until an operator recovers the cell.
+        recorder: where the last second before a stop is written; by default `stops` in the folder of the runs.
     """
 
     config: CellConfig
     devices: Devices
     latch: Latch = field(default_factory=Latch)
+    recorder: Recorder = field(init=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "recorder", Recorder(self.config.journal.runs / "stops"))
 
     @property
     def arm(self) -> Arm:
@@ -65,7 +71,7 @@ class Cell:
     @property
     def executor(self) -> Executor:
         """What runs checked plans on this cell."""
-        return Executor(self.devices, self.config, self.latch)
+        return Executor(self.devices, self.config, self.latch, self.recorder)
 
     def look(self, workspace: Workspace | None = None) -> View:
         """Read the camera and see what is on the table; see `robotcell.perception.view.look`.

@@ -115,7 +115,8 @@ def run_job(
             status = "refused"
             raise refusal
         job = _Job(cell, policy, journal, observers, job_id, run_dir, checked.view)
-        reason = job.pick_in_order(goals) if goals else job.pick_all()
+        with cell.recorder.into(run_dir):
+            reason = job.pick_in_order(goals) if goals else job.pick_all()
         status = "incomplete" if reason else "complete"
     except BaseException as error:
         reason = _describe(error)

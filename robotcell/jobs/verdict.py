@@ -100,8 +100,9 @@ def _judge_grasp(
     if execution.ending is Ending.CONTACT:
         return Result.COLLIDED, None, f"{execution.peak_force_n:.0f} N during {execution.step!r}"
     if execution.ending is Ending.EMPTY:
-        result = Result.MISSED if execution.step == HELD_AFTER_LIFT else Result.LOST
-        return result, None, f"the fingers were {width} apart at {execution.step!r}"
+        if execution.step == HELD_AFTER_LIFT:
+            return Result.MISSED, None, f"the fingers were {width} apart at {execution.step!r}"
+        return Result.LOST, None, f"lost on the way: the fingers were {width} apart at {execution.step!r}"
     taken = _taken(grasp, before, after)
     if taken is None:
         return Result.UNCONFIRMED, None, "something was held, but nothing is missing on the table"
