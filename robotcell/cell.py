@@ -37,16 +37,13 @@ class Cell:
         config: of the cell.
         devices: arm, gripper, camera and clock.
         latch: remembers a safety stop until an operator recovers the cell.
-        recorder: where the last second before a stop is written; by default `stops` in the folder of the runs.
+        recorder: where the last second before a stop is written.
     """
 
     config: CellConfig
     devices: Devices
     latch: Latch = field(default_factory=Latch)
-    recorder: Recorder = field(init=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "recorder", Recorder(self.config.journal.runs / "stops"))
+    recorder: Recorder = field(default_factory=Recorder)
 
     @property
     def arm(self) -> Arm:

@@ -80,7 +80,8 @@ class Executor:
         self._devices = devices
         self._latch = latch
         self._guard = Guard(config, latch)
-        self._recorder = recorder or Recorder(config.journal.runs / "stops")
+        self._recorder = recorder or Recorder()
+        self._stops = config.journal.runs / "stops"
         self._log = StateLog()
         # Of the fingers, as they were last asked [m].
         self._width_m = math.nan
@@ -256,7 +257,7 @@ class Executor:
     def _record(self, error: BaseException, label: str, reason: str, stopped_at: float) -> None:
         """Write the last second down, and have the error name the file."""
         try:
-            path = self._log.save(self._recorder, label, reason, stopped_at)
+            path = self._log.save(self._recorder.folder or self._stops, label, reason, stopped_at)
         except StorageError as problem:
             words = f"the last second could not be written: {problem}"
         else:
@@ -278,3 +279,4 @@ class Executor:
                 self._log.add(arm.state(), self._width_m)
                 arm.kick()
                 clock.sleep(PERIOD_S)
+            self._log.add(arm.state(), self._width_m)

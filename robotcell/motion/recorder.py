@@ -48,10 +48,10 @@ class Recorder:
     """Where the states before a stop are written to.
 
     Attributes:
-        folder: of the files; it is made when there is one to write.
+        folder: of the files, which is made when there is one to write; None: `stops` in the folder of the runs.
     """
 
-    folder: Path
+    folder: Path | None = None
 
     @contextmanager
     def into(self, folder: Path) -> Iterator[None]:
@@ -73,11 +73,11 @@ class StateLog:
         """Keep a measurement; the width of the fingers is NaN where they were not asked."""
         self._samples.append((state, width_m))
 
-    def save(self, recorder: Recorder, label: str, reason: str, stopped_at: float) -> Path | None:
+    def save(self, folder: Path, label: str, reason: str, stopped_at: float) -> Path | None:
         """Write `stop-<time>-<label>.csv` and the picture of it beside it; None where nothing was measured.
 
         Args:
-            recorder: says where.
+            folder: of the files.
             label: of what was stopped.
             reason: why, for the picture.
             stopped_at: when, on the cell's clock [s]; time 0 of the files. What comes later is the braking.
@@ -93,8 +93,8 @@ class StateLog:
         table = csv.writer(text, lineterminator="\n")
         table.writerow(_COLUMNS)
         table.writerows([*row, state.mode.value] for row, (state, _) in zip(values.round(5), samples, strict=True))
-        make_folder(recorder.folder)
-        path = recorder.folder / f"stop-{datetime.now():%Y%m%d-%H%M%S-%f}-{label}.csv"
+        make_folder(folder)
+        path = folder / f"stop-{datetime.now():%Y%m%d-%H%M%S-%f}-{label}.csv"
         write_whole(path, text.getvalue())
         write_image(path.with_suffix(".png"), _draw(values, reason))
         return path

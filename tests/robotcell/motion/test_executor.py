@@ -118,7 +118,7 @@ class Striking:
 def test_the_last_second_before_a_stop_is_kept_and_the_error_names_it(cell: Cell, tmp_path: Path) -> None:
     with cell.recorder.into(tmp_path), pytest.raises(GuardTripped, match="120 N") as tripped:
         run(cell, carry(cell), arm=Striking(cell, 0.45, 120.0), gripper=Losing(cell, math.inf))
-    assert cell.recorder.folder == cell.config.journal.runs / "stops"
+    assert cell.recorder.folder is None
     assert not cell.arm.moving
     (path,) = tmp_path.glob("*.csv")
     assert str(path) in str(tripped.value)
@@ -133,7 +133,7 @@ def test_the_last_second_before_a_stop_is_kept_and_the_error_names_it(cell: Cell
     assert force[t < -0.05].max() == 0.0
     assert force[t >= 0].min() == 120.0
     speeds = np.array([float(row["qd1_rad_s"]) for row in rows])
-    assert abs(speeds[-1]) < 0.1 < abs(speeds[t <= 0][-1])
+    assert abs(speeds[-1]) < 0.15 < abs(speeds[t <= 0][-1])
     assert {row["mode"] for row in rows} == {"ready"}
     assert float(rows[0]["width_m"]) == 0.04
     picture = cv2.imread(str(path.with_suffix(".png")))
