@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich.table import Table
 from rich.text import Text
 
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
+    from robotcell.motion.plan import MotionPlan
     from robotcell.perception.view import View
 
 
@@ -45,6 +48,7 @@ def run_pick(
     everything: bool,
     cell: CellChoice,
     *,
+    confirm: bool,
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -55,9 +59,12 @@ def run_pick(
         goals = _goals(goal, everything)
         config = cell.load()
         check_config(config)
+        if confirm and (dry_run or not sys.stdin.isatty()):
+            why = "a dry run moves nothing" if dry_run else "there is no terminal to ask at"
+            raise ConfigError(f"--confirm: {why}: leave it out")
         if dry_run:
             return _dry_run(goals, config, as_json=as_json)
-        report, error = _run(goals, config, progress())
+        report, error = _run(goals, config, progress(), confirm=confirm)
     except CellError as refusal:
         error = refusal
     if error is None and report is not None and not report.completed:
@@ -83,17 +90,19 @@ def _goals(goal: str | None, everything: bool) -> tuple[str, ...] | None:
     return words
 
 
-def _run(goals: tuple[str, ...] | None, config: CellConfig, err: Console) -> tuple[Report | None, CellError | None]:
+def _run(
+    goals: tuple[str, ...] | None, config: CellConfig, err: Console, *, confirm: bool
+) -> tuple[Report | None, CellError | None]:
     """Run a job to its end; the report, and the error that stopped it. Whatever started leaves its pictures."""
     with ExitStack() as stack:
         policy = make_policy(config.policy.name, config)
         journal = stack.enter_context(Journal(config.journal.database_url()))
         status = stack.enter_context(err.status(f"opening the cell ({config.backend.name})"))
         cell = stack.enter_context(open_cell(config))
-        pictures, following = JobPictures(config), _Progress(err, status)
+        pictures, following = JobPictures(config), _Progress(config, err, status)
         error = None
         try:
-            report = run_job(cell, policy, journal, goals, (pictures, following))
+            report = run_job(cell, policy, journal, goals, (pictures, following), following.ask if confirm else None)
         except CellError as stop:
             if following.job is None:
                 raise
@@ -147,7 +156,8 @@ def _as_json(action: Action) -> dict[str, Any]:
 class _Progress:
     """Prints a line per action while the job runs."""
 
-    def __init__(self, console: Console, status: Status) -> None:
+    def __init__(self, config: CellConfig, console: Console, status: Status) -> None:
+        self._config = config
         self._console = console
         self._status = status
         # The job's number and folder, once it has started.
@@ -174,6 +184,22 @@ class _Progress:
     def decided(self, decision: Decision) -> None:
         """Show the action that runs."""
         self._status.update(describe(decision))
+
+    def ask(self, decision: Decision, plan: MotionPlan) -> bool:
+        """Show an action and ask at the terminal whether it shall run; an interrupt ends the job."""
+        page = draw_decision(decision, self._config, f"{describe(decision)}: to be confirmed")
+        if self.job is not None:
+            path = self.job[1] / f"confirm-{decision.index:03d}.png"
+            write_image(path, page)
+            self._console.print(Text(f"picture: {path}"), soft_wrap=True)
+        self._console.print(Text(f"steps: {', '.join(step.label for step in plan.steps)}"), soft_wrap=True)
+        self._status.stop()
+        try:
+            return typer.confirm(f"{describe(decision)}: run it? (n: another one, Ctrl-C: end the job)", err=True)
+        except typer.Abort:
+            raise KeyboardInterrupt from None
+        finally:
+            self._status.start()
 
     def ended(self, decision: Decision, outcome: Outcome) -> None:
         """Print what came of it."""

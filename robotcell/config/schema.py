@@ -112,6 +112,9 @@ class Motion(_Table):
     linear_speed_m_s: Annotated[float, Field(gt=0, le=1)] = 0.4
     # Acceleration of the tcp on straight lines; the default is Universal Robots' own for movel.
     linear_acceleration_m_s2: Annotated[float, Field(gt=0, le=10)] = 1.2
+    # Share of its speed at which every motion is run: the same way, and as much more time for it. Accelerations are
+    # lowered by its square. `robotcell pick --speed` sets it.
+    speed_fraction: Annotated[float, Field(ge=0.05, le=1)] = 1.0
     # Speed of the last part of a descent, and of a push. A finger that lands on a block is stopped at 30 to 85 N
     # (measured in the twin; 90 N at 0.10, 75 N at 0.06).
     guarded_speed_m_s: Annotated[float, Field(gt=0, le=0.25)] = 0.08

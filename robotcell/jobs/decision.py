@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from robotcell.jobs.policy_api import Task
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
+    from robotcell.motion.plan import MotionPlan
     from robotcell.perception.view import View
 
 
@@ -33,6 +34,14 @@ class Decision:
     view: View
     task: Task
     action: Action
+
+
+class Confirm(Protocol):
+    """Asks somebody before an action is run."""
+
+    def __call__(self, decision: Decision, plan: MotionPlan) -> bool:
+        """Whether the plan of a decision, which was found safe, shall run; if not, another action is decided."""
+        ...
 
 
 class Observer(Protocol):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.errors import CellError, NoTarget, StorageError, UnsafeMotion
-from robotcell.jobs.decision import Decision, Observer
+from robotcell.jobs.decision import Confirm, Decision, Observer
 from robotcell.jobs.hidden_goal import place_after, uncover
 from robotcell.jobs.journal_tables import action_row, frame_row, outcome_row
 from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
@@ -78,11 +78,20 @@ def run_job(
     journal: Journal,
     goals: tuple[str, ...] | None,
     observers: tuple[Observer, ...] = (),
+    confirm: Confirm | None = None,
 ) -> Report:
     """Pick the goals (colours) in their order, or with None everything on the table.
 
     A goal that is not on the table when its turn comes ends the job; the report's reason lists what is there. What
     hides a goal that was seen before is pushed aside.
+
+    Args:
+        cell: open.
+        policy: that decides.
+        journal: of the job.
+        goals: the words of the goals, in their order.
+        observers: follow it.
+        confirm: is asked before each action; None runs them all.
 
     Raises:
         ConfigError: the configuration does not fit together.
@@ -114,7 +123,7 @@ def run_job(
         if refusal is not None:
             status = "refused"
             raise refusal
-        job = _Job(cell, policy, journal, observers, job_id, run_dir, checked.view)
+        job = _Job(cell, policy, journal, observers, confirm, job_id, run_dir, checked.view)
         with cell.recorder.into(run_dir):
             reason = job.pick_in_order(goals) if goals else job.pick_all()
         status = "incomplete" if reason else "complete"
@@ -133,6 +142,7 @@ class _Job:
     policy: Policy
     journal: Journal
     observers: tuple[Observer, ...]
+    confirm: Confirm | None
     job_id: int
     run_dir: Path
     # What the preflight saw, to begin with.
@@ -194,7 +204,7 @@ class _Job:
             # is hidden, nothing else than failures ends the search.
             if outcome.result is Result.PICKED:
                 failures = 0
-            elif not outcome.success or isinstance(task, Uncover):
+            elif outcome.result is not Result.DECLINED and (not outcome.success or isinstance(task, Uncover)):
                 failures += 1
             barred = () if outcome.result in SCENE_CHANGED else (*barred, action)
             if outcome.result is Result.PICKED and goal is not None:
@@ -234,6 +244,8 @@ class _Job:
             checked = check_path(plan, cell.config)
         except UnsafeMotion as error:
             return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan"))
+        if self.confirm is not None and not self.confirm(decision, checked.plan):
+            return view, Outcome(Result.DECLINED, None, "somebody who was asked said no", 0.0, float("nan"))
         execution = cell.executor.run(checked)
         if execution.ending is not Ending.DONE:
             cell.home()

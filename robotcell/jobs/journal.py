@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+# Results of actions in which nothing moved (`robotcell.jobs.verdict.Result`).
+NOT_RUN = ("refused", "declined")
+
+
 @dataclass(frozen=True)
 class Metrics:
     """The figures of a job.
@@ -157,7 +161,7 @@ class Journal:
         ended = (
             select(ActionRow.primitive, OutcomeRow.success, OutcomeRow.picked)
             .join(OutcomeRow)
-            .where(ActionRow.job_id == job_id, OutcomeRow.result != "refused")
+            .where(ActionRow.job_id == job_id, OutcomeRow.result.not_in(NOT_RUN))
             .order_by(ActionRow.id)
         )
         with self._reading() as session:

@@ -43,6 +43,7 @@ class Result(str, enum.Enum):
     PUSHED = "pushed"
     NOTHING_MOVED = "nothing moved"
     REFUSED = "refused"  # the plan was unsafe; nothing moved
+    DECLINED = "declined"  # by somebody who was asked; nothing moved
     STOPPED = "stopped"  # a device or the safety layer stopped the cell
 
 

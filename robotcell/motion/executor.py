@@ -82,6 +82,7 @@ class Executor:
         self._guard = Guard(config, latch)
         self._recorder = recorder or Recorder()
         self._stops = config.journal.runs / "stops"
+        self._speed_fraction = config.motion.speed_fraction
         self._log = StateLog()
         # Of the fingers, as they were last asked [m].
         self._width_m = math.nan
@@ -157,10 +158,11 @@ class Executor:
         start = arm.state()
         wrench_before = start.wrench
         self._guard.begin(course_of(step, path, lowest_tip_m), start)
+        pace = self._speed_fraction
         if isinstance(step, JointMove):
-            arm.start_joints(step.q, step.speed_rad_s, step.acceleration_rad_s2)
+            arm.start_joints(step.q, pace * step.speed_rad_s, pace**2 * step.acceleration_rad_s2)
         else:
-            arm.start_linear(step.T_base_tcp, step.speed_m_s, step.acceleration_m_s2)
+            arm.start_linear(step.T_base_tcp, pace * step.speed_m_s, pace**2 * step.acceleration_m_s2)
         peak, ending, periods = 0.0, Ending.DONE, 0
         self._period_began = moved_at = self._devices.clock.now()
         q_moved = start.q

@@ -98,6 +98,17 @@ def test_fingers_that_carry_nothing_are_not_asked(cell: Cell) -> None:
     assert gripper.asked == []
 
 
+def test_every_motion_is_as_much_slower_as_the_file_says(cell: Cell) -> None:
+    def lasts(fraction: float, angle: float) -> float:
+        motion = cell.config.motion.model_copy(update={"speed_fraction": fraction})
+        slow = replace(cell, config=cell.config.model_copy(update={"motion": motion}))
+        began, q = slow.clock.now(), slow.arm.state().q
+        slow.move(joints=q + np.array([angle, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        return slow.clock.now() - began
+
+    assert lasts(0.25, -0.2) == pytest.approx(4 * lasts(1.0, 0.2), rel=0.1)
+
+
 class Striking:
     """The cell's arm, whose tool meets something once it has turned by so much."""
 
