@@ -145,12 +145,12 @@ class Limits(_Table):
     joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 2.0
     # The same for the tool.
     tool_speed_m_s: Annotated[float, Field(gt=0, le=3)] = 1.5
-    # A force on the tool that stops the cell during a guarded motion, which ends by itself at motion.contact_force_n.
-    # The default is below the 150 N at which a UR5e's factory safety preset stops the arm.
+    # A force on the tool that stops the cell during a guarded motion, which ends by itself at motion.contact_force_n,
+    # and while something is carried: loads that are not held firmly strike the fingers with up to 72 N (novel objects,
+    # measured in the twin). The default is below the 150 N at which a UR5e's factory safety preset stops the arm.
     force_n: Annotated[float, Field(gt=0, le=250)] = 100.0
-    # The same where nothing is to be touched, if it is lower: in free motions, and with 20 N more, which a load may
-    # weigh, while one is carried. Free motions of the twin feel nothing, carried loads up to 20 N; what a UR5e reports
-    # of a tool in free air scatters by some newtons. Half of it for 0.3 s stops the cell too.
+    # The same in free motions, where nothing is to be touched, if it is lower. Those of the twin feel nothing; what a
+    # UR5e reports of a tool in free air scatters by some newtons. Half of it for 0.3 s stops the cell too.
     free_force_n: Annotated[float, Field(gt=0, le=250)] = 50.0
     # The same while the fingers move, which open by themselves at motion.closing_force_n. Below the controller's 150 N.
     grip_force_n: Annotated[float, Field(gt=0, le=250)] = 140.0

@@ -30,10 +30,8 @@ _BOX_SLACK_M = 0.005
 # the served twin in docs/explanation/safety.md.
 _REACTION_S = 0.03
 _BRAKES_RAD_S2 = 20.0
-# What a grip can hold (RG2 data sheet: payload 2 kg) weighs on the tool while it is carried.
-_LOAD_N = 20.0
 # Where nothing is to be touched, a force over this share of its limit for so long is no noise but something that gives
-# way slowly. Assumed; free motions of the twin show none, and carried loads up to 20 N.
+# way slowly. Assumed; free motions of the twin show none.
 _PRESSES_SHARE, _PRESSES_S = 0.5, 0.3
 # A motion that begins pressed against something, after a contact ended the one before, may press so much more until it
 # has left it, for at most so long. Assumed.
@@ -87,7 +85,7 @@ class Guard:
         self._low, self._high = (np.array([pair[i] for pair in corners])[:, None] for i in (0, 1))
         self._force_limits = {
             Phase.FREE: min(limits.free_force_n, limits.force_n),
-            Phase.CARRY: min(limits.free_force_n + _LOAD_N, limits.force_n),
+            Phase.CARRY: limits.force_n,
             Phase.GUARDED: limits.force_n,
             Phase.GRIP: limits.grip_force_n,
         }
@@ -201,14 +199,15 @@ class Guard:
     def _check_contact(self, force: float, now: float, course: Course) -> None:
         """The force on the tool [N]: an impact at once, and where nothing is to be touched a slow rise as well."""
         limit = self._force_limits[course.phase]
-        if course.phase in (Phase.GUARDED, Phase.GRIP):
+        if course.phase is not Phase.FREE:
             self._check_force(force, limit, course.phase.value)
             return
         if force <= limit * _PRESSES_SHARE:
             # It has left what it started against, if anything.
             self._leaving_n, self._pressing_since = 0.0, None
             return
-        self._check_force(force, min(max(limit, self._leaving_n), self._force_limits[Phase.GRIP]), course.phase.value)
+        most = min(max(limit, self._leaving_n), self._force_limits[Phase.GRIP])
+        self._check_force(force, most, course.phase.value)
         since = self._pressing_since = now if self._pressing_since is None else self._pressing_since
         if now - since > (_LEAVES_S if self._leaving_n else _PRESSES_S):
             raise _tripped(
