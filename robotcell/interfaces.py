@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from typing_extensions import Self
 
+    from robotcell.findings import Finding
+
 Array: TypeAlias = npt.NDArray[np.float64]
 
 # A motion that is not kicked for so long [s] stops, on every backend. Chosen: 25 periods of the executor, so that a
@@ -72,6 +74,25 @@ class GripperState:
     width_m: float
     busy: bool
     grip_detected: bool
+
+
+@dataclass(frozen=True)
+class GripperRange:
+    """What a gripper can do with the finger tips that are mounted on it.
+
+    Attributes:
+        fingertip_offset_m: how far each tip reaches inwards from the bare finger, outwards where negative.
+        min_width_m: between the tips of the fingers when they are closed as far as they go.
+        max_width_m: the same when they are wide open.
+        min_force_n: of a grip.
+        max_force_n: of a grip.
+    """
+
+    fingertip_offset_m: float
+    min_width_m: float
+    max_width_m: float
+    min_force_n: float
+    max_force_n: float
 
 
 @dataclass(frozen=True)
@@ -194,6 +215,14 @@ class Arm(Device, Protocol):
         """The newest measurement."""
         ...
 
+    def report(self) -> tuple[Finding, ...]:
+        """What the arm says of its own settings that a motion depends on; nothing where it cannot be asked.
+
+        Payload and tool centre point as they are read back, remote control, speed slider. Takes some tens of
+        milliseconds, and is asked before a job.
+        """
+        ...
+
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint-space motion to q (6,) [rad], the leading joint at the given speed."""
         ...
@@ -236,6 +265,10 @@ class Gripper(Device, Protocol):
 
     def state(self) -> GripperState:
         """The newest measurement."""
+        ...
+
+    def range(self) -> GripperRange:
+        """What it can reach, with the finger tips that it has."""
         ...
 
     def start_width(self, width_m: float, force_n: float) -> None:

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 from robotcell.errors import CellError, NoTarget, StorageError, UnsafeMotion
 from robotcell.io.atomic_file import make_folder
 from robotcell.jobs.choice import Choice, choose, task_for
-from robotcell.jobs.decision import Decision, Hold, Observer
+from robotcell.jobs.decision import Confirm, Decision, Hold, Observer
 from robotcell.jobs.journal_tables import action_of, action_row, frame_row, outcome_row
 from robotcell.jobs.look_ahead import LookAhead
 from robotcell.jobs.policy_api import Observation
+from robotcell.jobs.preflight import preflight
 from robotcell.jobs.progress import Progress
 from robotcell.jobs.resuming import check_resumable, cut_off, judge_resumed, replay, settle, task_of
 from robotcell.jobs.run_folder import load_frame, make_run_dir, save_frame
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from robotcell.jobs.journal import Journal, Metrics
     from robotcell.jobs.journal_tables import ActionRow
     from robotcell.jobs.policy_api import Policy
+    from robotcell.jobs.preflight import Preflight
     from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.view import View
 
@@ -81,6 +83,7 @@ def run_job(
     goals: tuple[str, ...] | None,
     observers: tuple[Observer, ...] = (),
     hold: Hold | None = None,
+    confirm: Confirm | None = None,
 ) -> Report:
     """Pick the goals (colours) in their order, or with None everything on the table.
 
@@ -94,21 +97,29 @@ def run_job(
         goals: the words of the goals, in their order.
         observers: follow it.
         hold: asked before each action; see `Hold`.
+        confirm: asked before each action; None runs them all.
 
     Raises:
         ConfigError: the configuration does not fit together.
+        CellError: the preflight found something wrong, and nothing moved; the journal has the job as refused, and
+            `preflight.json` in its folder all findings.
         StorageError: the folder of the run, an image or the journal cannot be written.
         DeviceFault, ConnectionLost, GuardTripped, CalibrationError, UnsafeMotion: the cell was stopped. The journal
             has it; after a motion was cut short, the cell's latch holds until `Cell.recover`.
     """
     check_config(cell.config)
-    cell.latch.check()
-    run_dir = make_run_dir(cell.config.journal.runs, "-".join(goals) if goals else "all")
+    began = cell.clock.now()
+    checked = preflight(cell, journal, policy.workspace)
     # A database URL may hold a password.
     settings = cell.config.model_dump(mode="json", exclude={"journal": {"url"}})
-    job_id = journal.start_job(goals, policy.name, settings, run_dir, cell.lock)
-    job = _Job(cell, policy, journal, observers, hold, job_id, run_dir, goals, cell.clock.now())
-    return job.run(job.start)
+    try:
+        run_dir = make_run_dir(cell.config.journal.runs, "-".join(goals) if goals else "all")
+        job_id = journal.start_job(goals, policy.name, settings, run_dir, cell.lock)
+    except StorageError as error:
+        # What the preflight found says this too, and whatever else is wrong.
+        raise checked.refusal() or error from None
+    job = _Job(cell, policy, journal, observers, hold, confirm, job_id, run_dir, goals, began)
+    return job.run(checked, lambda: job.start(checked.view))
 
 
 def resume_job(
@@ -118,6 +129,7 @@ def resume_job(
     job_id: int,
     observers: tuple[Observer, ...] = (),
     hold: Hold | None = None,
+    confirm: Confirm | None = None,
 ) -> Report:
     """Go on with a job that was killed or stopped, whenever that was.
 
@@ -131,23 +143,29 @@ def resume_job(
         job_id: number of the job, the last one of this cell.
         observers: follow it.
         hold: asked before each action; see `Hold`.
+        confirm: asked before each action; None runs them all.
 
     Raises:
         ConfigError: the job cannot be resumed here.
+        CellError: the preflight found something wrong, and nothing moved.
         DeviceFault: the gripper holds something that the job did not take.
         StorageError, ConnectionLost, GuardTripped, CalibrationError, UnsafeMotion: as `run_job`.
     """
     check_config(cell.config)
-    cell.latch.check()
     row = journal.job(job_id)
     lock = check_resumable(row, cell, policy.name, journal)
     run_dir = Path(row.run_dir)
     make_folder(run_dir)
-    journal.resume_job(job_id, lock)
     began = cell.clock.now() - (row.cell_s or 0.0)
+    checked = preflight(cell, journal, policy.workspace)
+    refusal = checked.refusal()
+    if refusal is not None:
+        # It stays what it was: a job that can be resumed.
+        raise refusal
+    journal.resume_job(job_id, lock)
     goals = tuple(row.goals) if row.goals else None
-    job = _Job(cell, policy, journal, observers, hold, job_id, run_dir, goals, began, len(row.actions))
-    return job.run(lambda: job.pick_up(row.actions))
+    job = _Job(cell, policy, journal, observers, hold, confirm, job_id, run_dir, goals, began, len(row.actions))
+    return job.run(checked, lambda: job.pick_up(row.actions))
 
 
 @dataclass(frozen=True)
@@ -165,6 +183,7 @@ class _Job:
     journal: Journal
     observers: tuple[Observer, ...]
     hold: Hold | None
+    confirm: Confirm | None
     job_id: int
     run_dir: Path
     goals: tuple[str, ...] | None
@@ -173,17 +192,25 @@ class _Job:
     actions: int = 0
     progress: Progress = field(default_factory=Progress)
 
-    def run(self, start: Callable[[], View]) -> Report:
+    def run(self, checked: Preflight, start: Callable[[], View]) -> Report:
         """Start or pick up the job, and work until it ends; how it ended is on record."""
+        status = "stopped"
         try:
             for observer in self.observers:
                 observer.started(self.job_id, self.run_dir)
-            reason = self.work(start())
-            self.go_home()
+                observer.checked(checked.findings)
+            checked.save(self.run_dir)
+            refusal = checked.refusal()
+            if refusal is not None:
+                status = "refused"
+                raise refusal
+            with self.cell.recorder.into(self.run_dir):
+                reason = self.work(start())
+                self.go_home()
         except BaseException as error:
             # What stopped the job says more than a journal that cannot be told of it.
             with suppress(StorageError):
-                self.journal.end_job(self.job_id, "stopped", _describe(error), self.cell_s())
+                self.journal.end_job(self.job_id, status, _describe(error), self.cell_s())
             raise
         self.journal.end_job(self.job_id, "incomplete" if reason else "complete", reason, self.cell_s())
         return Report(self.job_id, self.run_dir, not reason, reason, self.journal.metrics(self.job_id), self.cell_s())
@@ -192,8 +219,10 @@ class _Job:
         """How long the job has taken, on the cell's clock [s]."""
         return self.cell.clock.now() - self.began
 
-    def start(self) -> View:
-        """Go home from wherever the arm stands, and look."""
+    def start(self, seen: View | None) -> View:
+        """Go home from wherever the arm stands, and look, unless the arm is there and `seen` is of now."""
+        if seen is not None and at_home(self.cell.arm.state(), self.cell.config):
+            return self._seen(seen)
         self.go_home()
         return self._look()
 
@@ -308,6 +337,8 @@ class _Job:
             checked = self._plan(decision)
         except UnsafeMotion as error:
             return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan")), None
+        if self.confirm is not None and not self.confirm(decision, checked):
+            return view, Outcome(Result.DECLINED, None, "somebody who was asked said no", 0.0, float("nan")), None
         with LookAhead(cell, self.policy.workspace, lambda after: self._think(decision, after)) as looking:
             execution = cell.executor.run(checked, lambda label: self.journal.held(action_id, label), looking.poll)
             seen = looking.result() if execution.ending is Ending.DONE else None

@@ -53,7 +53,8 @@ class Job(Base):
     config: Mapped[dict[str, Any]] = mapped_column(JSON)
     # Folder of the run.
     run_dir: Mapped[str]
-    # running, complete, incomplete or stopped. A job that was killed stays at running; its lock tells.
+    # running, complete, incomplete, stopped, or refused (before it began: what was wrong is the reason). A job that was
+    # killed stays at running; its lock tells.
     status: Mapped[str] = mapped_column(default="running")
     # Why it is not complete.
     reason: Mapped[str] = mapped_column(default="")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import closed_width, narrowest_hold
 from robotcell.geometry import rg2, ur5e
 from robotcell.motion.plan import (
     CheckHold,
@@ -125,9 +127,9 @@ def plan_grasp(
         # It ends above all that is under the fingers; what they pass beside is the business of who decided.
         linear_move("descend", T_near, config, touch_m=touch_m),
         guarded_move("descend guarded", T_grasp, config, touch_m),
-        Grip("close", rg2.MIN_WIDTH_M, use.force_n, motion.closing_force_n),
+        Grip("close", closed_width(config), use.force_n, motion.closing_force_n),
         linear_move("lift", T_lifted, config, load_m, touch_m, blend_radius(T_lifted[2, 3] - tcp_z)),
-        CheckHold(HELD_AFTER_LIFT, use.empty_width_m),
+        CheckHold(HELD_AFTER_LIFT, narrowest_hold(config)),
         *_carry(grasp, q_above if q_lifted is None else q_lifted, config),
     )
     return MotionPlan("grasp", q_start, steps)
@@ -162,7 +164,7 @@ def _carry(grasp: Grasp, q_from: Array, config: CellConfig) -> tuple[Step, ...]:
     bin_z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M + load_m - LOAD_REACH_M
     return (
         joint_move("carry to bin", _over_bin((bin_x, bin_y, bin_z), q_from, config), config, load_m),
-        CheckHold(HELD_OVER_BIN, use.empty_width_m),
+        CheckHold(HELD_OVER_BIN, narrowest_hold(config)),
         Shape("release", use.preshape_m, use.force_n, _RELEASED_M),
     )
 
@@ -184,6 +186,12 @@ def _over_bin(place: tuple[float, float, float], q_from: Array, config: CellConf
     # Of equal ways, the one that ends nearest to home.
     home = np.array(config.motion.home_q)
     return min(turns, key=lambda q: (round(float(np.abs(q - q_from).max()), 2), float(np.abs(q - home).max())))
+
+
+def release_corners(config: CellConfig) -> tuple[tuple[float, float, float], ...]:
+    """Where (x, y, z) [m] the tcp goes over the bin: the farthest points at which a grasp lets go."""
+    z = config.table.height_m + config.bin.wall_height_m + _BIN_CLEARANCE_M
+    return tuple((*_release_point(x, y, config), z) for x, y in product(config.workspace.x, config.workspace.y))
 
 
 def _release_point(x: float, y: float, config: CellConfig) -> tuple[float, float]:

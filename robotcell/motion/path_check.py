@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.config.fingers import gripper_range, with_tips
 from robotcell.config.surroundings import obstacles
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, rg2, ur5e
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from robotcell.config import CellConfig, KeepOut
+    from robotcell.interfaces import GripperRange
     from robotcell.motion.plan import Step
     from robotcell.perception.clearance_map import ClearanceMap
 
@@ -121,7 +123,7 @@ def check_step(
 def _leg(q: Array, step: Step, config: CellConfig, name: str) -> Array:
     """Joint angles (N, 6) along one step from q (6,); (1, 6) where the arm stands. Speeds and ranges are checked."""
     if isinstance(step, Grip | Shape):
-        _check_grip(step, name)
+        _check_grip(step, gripper_range(config), name)
         return q[None]
     if isinstance(step, CheckHold):
         return q[None]
@@ -215,11 +217,17 @@ def outside_box(points: Array, config: CellConfig, slack_m: float, lowest_m: flo
     return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))
 
 
-def _check_grip(step: Grip | Shape, name: str) -> None:
-    if not rg2.MIN_WIDTH_M <= step.width_m <= rg2.MAX_WIDTH_M:
-        raise UnsafeMotion(f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's 0 to 110 mm")
-    if not rg2.MIN_FORCE_N <= step.force_n <= rg2.MAX_FORCE_N:
-        raise UnsafeMotion(f"{name}: force {step.force_n:.1f} N is outside the gripper's 3 to 40 N")
+def _check_grip(step: Grip | Shape, reach: GripperRange, name: str) -> None:
+    if not reach.min_width_m - _ROUNDING_M <= step.width_m <= reach.max_width_m + _ROUNDING_M:
+        raise UnsafeMotion(
+            f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's {1000 * reach.min_width_m:.0f} to "
+            f"{1000 * reach.max_width_m:.0f} mm{with_tips(reach)}"
+        )
+    if not reach.min_force_n <= step.force_n <= reach.max_force_n:
+        raise UnsafeMotion(
+            f"{name}: force {step.force_n:.1f} N is outside the gripper's {reach.min_force_n:.0f} to "
+            f"{reach.max_force_n:.0f} N"
+        )
 
 
 def _joint_vector(q: Array, name: str) -> Array:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import gripper_range
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform
@@ -92,19 +93,21 @@ def near_height(
         tcp_z: z of the tcp at the end of the descent [m].
         config: of the cell.
     """
-    highest = config.table.height_m + _clear_above(heightmap, x, y, theta, opening_m)
-    near = highest + _NEAR_M - rg2.tip_retraction(opening_m)
+    offset_m = gripper_range(config).fingertip_offset_m
+    thickness = rg2.finger_thickness(offset_m)
+    highest = config.table.height_m + _clear_above(heightmap, x, y, theta, opening_m, thickness)
+    near = highest + _NEAR_M - rg2.tip_retraction(opening_m, offset_m)
     return float(np.clip(near, tcp_z, tcp_z + config.motion.approach_m))
 
 
-def _clear_above(heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float) -> float:
+def _clear_above(heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float, thickness_m: float) -> float:
     """Height [m above the table] above which nothing is expected under the gripper, turned by theta and so far open.
 
     The highest cell that was seen there; where a cell is unknown, or lies outside the map, at least the tallest
     object. Gaps between pixels are closed first.
     """
     workspace = heightmap.workspace
-    half_x = opening_m / 2 + rg2.FINGER_THICKNESS_M + _AROUND_M
+    half_x = opening_m / 2 + thickness_m + _AROUND_M
     half_y = rg2.FINGER_BREADTH_M / 2 + _AROUND_M
     steps = [np.arange(-half, half + workspace.resolution_m, workspace.resolution_m) for half in (half_x, half_y)]
     u, v = np.meshgrid(*steps)

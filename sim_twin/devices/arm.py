@@ -28,6 +28,7 @@ from sim_twin.world.simulation import STEP_S
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from robotcell.findings import Finding
     from robotcell.interfaces import Array, Waypoint
     from sim_twin.world.world import World
 
@@ -98,6 +99,11 @@ class TwinArm(Arm):
             wrench=self._world.contact().tool_wrench(T_base_tcp[:3, 3]),
             mode=self._mode,
         )
+
+    def report(self) -> tuple[Finding, ...]:
+        """Nothing: it has no settings of its own that could differ from the cell's."""
+        self._need_connection()
+        return ()
 
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint-space motion; see `Arm`.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.findings import Grade
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import make_transform, rotation_angle, rotation_z
 from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode, JointWaypoint, LinearWaypoint
@@ -37,12 +38,14 @@ def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:
 
 
 @pytest.mark.parametrize(
-    "call", ["state", "stop", "kick", "recover", "moving", "start_joints", "start_linear", "start_path"]
+    "call",
+    ["state", "report", "stop", "kick", "recover", "moving", "start_joints", "start_linear", "start_path"],
 )
 def test_refuses_everything_before_it_is_connected(closed_cell: Cell, call: str) -> None:
     arm = closed_cell.arm
     calls: dict[str, Callable[[], object]] = {
         "state": arm.state,
+        "report": arm.report,
         "stop": arm.stop,
         "kick": arm.kick,
         "recover": arm.recover,
@@ -64,6 +67,10 @@ def test_state_is_one_consistent_measurement(cell: Cell) -> None:
     # A real arm's own calibration differs from the nominal one by some millimetres.
     assert np.abs(state.T_base_tcp - ur5e.forward(state.q) @ tip).max() < 0.01
     np.testing.assert_allclose(state.q, cell.config.motion.home_q, atol=0.01)
+
+
+def test_a_connected_arm_reports_nothing_that_keeps_it_from_a_job(cell: Cell) -> None:
+    assert [finding for finding in cell.arm.report() if finding.grade is Grade.WRONG] == []
 
 
 def test_joint_motion_returns_at_once_and_arrives(cell: Cell, pace: float) -> None:

@@ -20,10 +20,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.drivers.ur5e.child_process import ChildProcess
 from robotcell.drivers.ur5e.controller import arm_mode, inspect, obstacles, program_held, slow_slider, why_not_ready
+from robotcell.drivers.ur5e.controller_findings import TCP_OFFSET, controller_findings, tool_findings
 from robotcell.drivers.ur5e.dashboard import Dashboard
 from robotcell.drivers.ur5e.messages import Setup, StartJoints, StartLinear, StartPath
 from robotcell.errors import CellError, ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
-from robotcell.geometry import rg2
 from robotcell.geometry.controller_ranges import check_path_motion
 from robotcell.geometry.transforms import make_transform, matrix_to_rotvec, rotvec_to_matrix
 from robotcell.interfaces import Arm, ArmMode, ArmState, JointWaypoint, LinearWaypoint
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from robotcell.drivers.ur5e.controller import Controller
+    from robotcell.findings import Finding
     from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Clock, Waypoint
 
@@ -139,6 +140,13 @@ class UR5e(Arm):
             wrench=record["tcp_force"],
             mode=_mode(record),
         )
+
+    def report(self) -> tuple[Finding, ...]:
+        """What the controller says of itself and of the tool that was set at connect; see `Arm`."""
+        self._record()
+        controller = inspect(self._options.host)
+        tool = tool_findings(controller, self._options.payload_kg, self._options.payload_cog, changed=True)
+        return (*controller_findings(controller), *tool)
 
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint-space motion; see `Arm`.
@@ -270,11 +278,10 @@ class UR5e(Arm):
 
     def _start_child(self, *, control: bool) -> None:
         options = self._options
-        T = rg2.T_FLANGE_TCP
         setup = Setup(
             host=options.host,
             control=control,
-            tcp_offset=(*T[:3, 3].tolist(), *matrix_to_rotvec(T[:3, :3]).tolist()),
+            tcp_offset=TCP_OFFSET,
             payload_kg=options.payload_kg,
             payload_cog=options.payload_cog,
         )

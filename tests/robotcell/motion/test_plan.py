@@ -150,7 +150,7 @@ def test_a_motion_is_blended_with_free_motions_only(after: str) -> None:
     T = ur5e.forward(HOME) @ rg2.T_FLANGE_TCP
     steps: list[Step] = [joint_move("first", HOME, CONFIG, blend_m=0.02)]
     if after == "guarded":
-        steps.append(guarded_move("second", T, CONFIG))
+        steps.append(guarded_move("second", T, CONFIG, 0.1))
     elif after == "grip":
         steps.append(Grip("second", 0.02, 20.0))
     with pytest.raises(UnsafeMotion, match="cannot be blended"):
