@@ -273,7 +273,8 @@ class Guard:
         limit = self._config.limits.state_age_s
         if state.mode is not ArmMode.READY:
             raise DeviceFault(
-                f"the arm is in {state.mode.value}; clear the cause at the cell, then run robotcell recover", device="arm"
+                f"the arm is in {state.mode.value}; clear the cause at the cell, then run robotcell recover",
+                device="arm",
             )
         age = now - state.t
         if not -_CLOCK_SLACK_S <= age <= limit:
