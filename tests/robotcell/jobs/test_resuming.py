@@ -160,7 +160,7 @@ def test_a_stop_that_cannot_be_recorded_holds_and_says_so(
 ) -> None:
     (tmp_path / "runs").write_text("a file where the folder should be")
     with Twin(config) as (cell, _):
-        monkeypatch.setattr(cell.arm, "start_joints", lambda *_: None)  # an arm that does not obey
+        monkeypatch.setattr(cell.arm, "start_path", lambda *_: None)  # an arm that does not obey
         with pytest.raises(GuardTripped, match=r"ended .* from its target.*the stop could not be recorded"):
             cell.move(joints=turned(config, 0.3))
         with pytest.raises(GuardTripped, match="nothing moves"):
