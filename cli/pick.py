@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
@@ -13,12 +13,12 @@ from cli.console import error_as_json, print_json, progress, report_error, resul
 from cli.keyboard import KeyboardHold
 from policy import make_policy
 from robotcell.config import find_backend
-from robotcell.errors import CellError, ConfigError, NoTarget
+from robotcell.errors import CellError, ConfigError, NoTarget, StorageError, UnsafeMotion
 from robotcell.io.images import write_image
 from robotcell.jobs.job import Report, preview, resume_job, run_job
 from robotcell.jobs.journal import Journal
 from robotcell.jobs.opening import open_cell
-from robotcell.jobs.pictures import JobPictures, describe, draw_decision
+from robotcell.jobs.pictures import JobPictures, describe, draw_preview
 from robotcell.jobs.run_folder import make_run_dir
 from robotcell.motion.config_check import check_config
 from robotcell.motion.grasp import Grasp
@@ -69,6 +69,8 @@ def run_resume(job_id: int | None, cell: CellChoice, *, as_json: bool) -> int:
     try:
         config = cell.load()
         check_config(config)
+        if config.journal.url is None and not config.journal.default_file.exists():
+            raise ConfigError(f"there is no journal {config.journal.default_file}: start a job with robotcell pick")
         with Journal(config.journal.database_url()) as journal:
             job = _last_job(journal, config) if job_id is None else journal.job(job_id)
         config = config.model_copy(update={"policy": config.policy.model_copy(update={"name": job.policy})})
@@ -143,7 +145,9 @@ def _run(
                 job_id, run_dir, False, str(stop), journal.metrics(job_id), journal.job(job_id).cell_s or 0.0
             )
         status.update("drawing the summary")
-        pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
+        # What stopped the job says more than pictures that cannot be written.
+        with nullcontext() if error is None else suppress(StorageError):
+            pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
         return report, error
 
 
@@ -151,10 +155,13 @@ def _dry_run(goals: tuple[str, ...] | None, config: CellConfig, *, as_json: bool
     goal = goals[0] if goals else None
     policy = make_policy(config.policy.name, config)
     with progress().status("looking, deciding and planning"), open_cell(config) as cell:
-        decision, checked = preview(cell, policy, goal)
+        decision, plan = preview(cell, policy, goal)
     path = make_run_dir(config.journal.runs, "dry-run") / "plan.png"
-    write_image(path, draw_decision(decision, config, f"{describe(decision)}: dry run, nothing moved"))
-    steps = [step.label for step in checked.plan.steps]
+    verdict = "refused, see the last panel" if isinstance(plan, UnsafeMotion) else "dry run, nothing moved"
+    write_image(path, draw_preview(decision, plan, config, f"{describe(decision)}: {verdict}"))
+    if isinstance(plan, UnsafeMotion):
+        raise UnsafeMotion(f"{describe(decision)}: {plan}; picture: {path}") from plan
+    steps = [step.label for step in plan.plan.steps]
     if as_json:
         action = decision.action
         print_json(

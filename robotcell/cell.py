@@ -16,7 +16,7 @@ from robotcell.motion.executor import Execution, Executor
 from robotcell.motion.guard import Latch
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
-from robotcell.motion.retreat import plan_recovery, plan_retreat
+from robotcell.motion.retreat import check_retreat, plan_recovery
 from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from robotcell.motion.guard import StopStore
     from robotcell.motion.path_check import CheckedPlan
     from robotcell.motion.plan import Step
+    from robotcell.perception.clearance_map import ClearanceMap
 
 
 @dataclass(frozen=True)
@@ -135,28 +136,34 @@ class Cell:
         """
         return self.run([Grip("grip", width_m, force_n or self.config.gripper.force_n)], "grip")
 
-    def home(self) -> Execution:
+    def home(self, seen: ClearanceMap | None = None) -> Execution:
         """Straight up, open the fingers, and to the home pose, supervised.
+
+        Args:
+            seen: what may stand on the table, by the last look (`View.clearance`). Without it the arm goes up as high
+                as it can first, and does not know what stands in its way.
 
         Raises:
             UnsafeMotion: the way is not safe; nothing moved.
             GuardTripped, DeviceFault, ConnectionLost: it was stopped; recover the cell before the next motion.
         """
-        return self.executor.run(check_path(plan_retreat(self.arm.state(), self.config), self.config))
+        return self.executor.run(check_retreat(self.arm.state(), self.config, seen))
 
-    def run(self, steps: Sequence[Step], label: str) -> Execution:
+    def run(self, steps: Sequence[Step], label: str, seen: ClearanceMap | None = None) -> Execution:
         """Check steps as one plan from where the arm stands, run it supervised, and wait for its end.
 
         Args:
             steps: of the plan.
             label: what the plan is called in errors.
+            seen: what may stand on the table, by the last look (`View.clearance`); without it the plan is checked
+                against the furniture only.
 
         Raises:
             UnsafeMotion: a step is not safe; nothing moved.
             GuardTripped, DeviceFault, ConnectionLost: it was stopped; recover the cell before the next motion.
         """
         plan = MotionPlan(label, self.arm.state().q, tuple(steps))
-        return self.executor.run(check_path(plan, self.config))
+        return self.executor.run(check_path(plan, self.config, seen))
 
     def recovery(self) -> CheckedPlan:
         """The motion that `recover` makes from where the arm stands now.

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
     from types import TracebackType
 
     from typing_extensions import Self
@@ -145,6 +146,35 @@ class Device(Protocol):
         self.close()
 
 
+@dataclass(frozen=True)
+class JointWaypoint:
+    """One leg of a path: a joint-space motion to q (6,) [rad], the leading joint at the given speed and acceleration.
+
+    Within `blend_m` of its end the tcp may leave it for the next leg; 0: it comes to rest there.
+    """
+
+    q: Array
+    speed_rad_s: float
+    acceleration_rad_s2: float
+    blend_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class LinearWaypoint:
+    """One leg of a path: a straight motion of the tcp to `T_base_tcp` (4, 4), rotation interpolated.
+
+    Within `blend_m` of its end the tcp may leave it for the next leg; 0: it comes to rest there.
+    """
+
+    T_base_tcp: Array
+    speed_m_s: float
+    acceleration_m_s2: float
+    blend_m: float = 0.0
+
+
+Waypoint: TypeAlias = JointWaypoint | LinearWaypoint
+
+
 class Arm(Device, Protocol):
     """A six-joint arm. Motions return at once; the caller supervises them with `moving`, `state`, `kick` and `stop`.
 
@@ -173,6 +203,14 @@ class Arm(Device, Protocol):
 
         Only the ranges of the arguments are checked here: a line that the arm cannot follow ends in a stop that must be
         recovered. `robotcell.motion.path_check` finds such lines before anything moves.
+        """
+        ...
+
+    def start_path(self, waypoints: Sequence[Waypoint]) -> None:
+        """Start one motion along several legs, with rounded corners (`robotcell.geometry.rounded_path`).
+
+        What `start_joints` and `start_linear` say of their arguments holds for each leg. The last waypoint has no
+        `blend_m`: the motion ends there, at rest.
         """
         ...
 
@@ -231,6 +269,18 @@ class Camera(Device, Protocol):
         Raises:
             ConnectionLost: no frame came.
             DeviceFault: the device delivers stale or unusable frames.
+        """
+        ...
+
+    def poll(self, since: float) -> Callable[[], RgbdFrame] | None:
+        """A frame that was captured at `since` [s] on the cell's clock or later; None until there is one.
+
+        Returns at once, so that it can be called while the arm is supervised. What it returns makes the images; it
+        takes its time, touches no device, and may be called in another thread before the camera is used again.
+
+        Raises:
+            ConnectionLost: the camera is not connected, or no frame comes.
+            DeviceFault: as `read`; from what is returned as well.
         """
         ...
 

@@ -10,8 +10,8 @@ import numpy.typing as npt
 _BORDER_M = 0.020
 # Paper, stage II: a push that frees more than tau of its object's border earns the reward, and is worth making.
 USEFUL_GAIN = 0.1
-# Paper: a cell of the border that is so high is occupied.
-_OCCUPIED_M = (0.02, 0.30)
+# Paper: a cell of the border that is so high is occupied. (There it ends at 0.30 m, above which its map saw nothing.)
+_OCCUPIED_M = 0.02
 
 
 def border_cells(mask: npt.NDArray[np.bool_], resolution_m: float) -> npt.NDArray[np.intp]:
@@ -29,9 +29,8 @@ def border_cells(mask: npt.NDArray[np.bool_], resolution_m: float) -> npt.NDArra
 
 def is_occupied(height_m: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
     """Whether cells of that height are occupied; those that were not seen (NaN) are not."""
-    low, high = _OCCUPIED_M
     with np.errstate(invalid="ignore"):
-        return np.asarray((height_m > low) & (height_m < high))
+        return np.asarray(height_m > _OCCUPIED_M)
 
 
 def border_occupancy(mask: npt.NDArray[np.bool_], height_m: npt.NDArray[np.float32], resolution_m: float) -> float:

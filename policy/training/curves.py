@@ -25,15 +25,18 @@ _PANELS: tuple[tuple[str, str, dict[str, str]], ...] = (
 )
 # Axes that run from 0 to 1.
 _PARTS = ("rewarded", "area under ROC")
+_ROOM = {"left": 0.05, "right": 0.985, "bottom": 0.07, "top": 0.95, "wspace": 0.22, "hspace": 0.28}
 
 
 def draw_curves(history: Sequence[dict[str, float]], path: Path) -> None:
     """Draw the metrics of all rounds as a PNG; a line marks where stage 2 begins. Replaces the file at once."""
-    figure = Figure(figsize=(13, 7), layout="constrained")
+    figure = Figure(figsize=(13, 7))
     FigureCanvasAgg(figure)
+    # Room for titles and labels. A layout that measures them draws everything three times, after every round.
+    panels = figure.subplots(2, 3, gridspec_kw=_ROOM)
     rounds = range(1, len(history) + 1)
     boundaries = [i + 0.5 for i in range(1, len(history)) if history[i]["stage"] != history[i - 1]["stage"]]
-    for axes, (title, label, names) in zip(figure.subplots(2, 3).flat, _PANELS, strict=True):
+    for axes, (title, label, names) in zip(panels.flat, _PANELS, strict=True):
         for key, name in names.items():
             axes.plot(rounds, [line[key] for line in history], marker=".", label=name)
         for boundary in boundaries:

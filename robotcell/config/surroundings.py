@@ -15,13 +15,16 @@ _HANGING_SLOPE = 0.1
 
 def obstacles(config: CellConfig) -> tuple[KeepOut, ...]:
     """Everything that arm and gripper must not enter: the keep-outs of the file, the bin, the camera and its post."""
-    table = config.table.height_m
-    (bx, by), (sx, sy) = config.bin.center, config.bin.size
-    bin_box = _box("bin", (bx, by, table + config.bin.wall_height_m / 2), (sx, sy, config.bin.wall_height_m))
     x, y, z = config.camera.pose()[:3, 3]
     camera = _box("camera", (x, y, z), (_CAMERA_M, _CAMERA_M, _CAMERA_M))
     post = camera_post(config)
-    return (*config.keep_out, bin_box, camera, *((post,) if post else ()))
+    return (*config.keep_out, bin_box(config), camera, *((post,) if post else ()))
+
+
+def bin_box(config: CellConfig) -> KeepOut:
+    """The bin with all that is in it."""
+    (x, y), (length, width), height = config.bin.center, config.bin.size, config.bin.wall_height_m
+    return _box("bin", (x, y, config.table.height_m + height / 2), (length, width, height))
 
 
 def camera_post(config: CellConfig) -> KeepOut | None:

@@ -7,6 +7,7 @@ the UR5e (joint housings 120 to 150 mm, upper arm 110 mm, forearm 90 mm and wris
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,8 +53,25 @@ _BODIES = (
     (6, (0.0, 0.0, -0.05), (0.0, 0.0, 0.0), 0.045),
     (6, (0.0, 0.0, 0.05), (0.0, 0.0, rg2.PALM_M), 0.055),
 )
+# What errors call the bodies.
+BODY_NAMES = (
+    "base",
+    "shoulder",
+    "upper arm",
+    "elbow",
+    "forearm",
+    "first wrist",
+    "second wrist",
+    "third wrist",
+    "gripper",
+)
+# The gripper's body, which `tool_points` has in more detail.
+GRIPPER_GROUP = 8
 # Bodies this many places apart in the chain share a joint housing or a neighbour's, and cannot touch.
 _NEIGHBOURS = 2
+# Fingers, open any way, and a load lie within so many spheres of this radius.
+_HAND_SPHERES, _HAND_M = 5, 0.070
+_FOREARM = 4
 
 
 def robot_spheres() -> Spheres:
@@ -70,27 +88,54 @@ def robot_spheres() -> Spheres:
 
 
 SPHERES = robot_spheres()
+# Bodies are listed from the base on, so the spheres of a link follow each other.
+_CENTERS_BY_LINK = [(int(link), SPHERES.center[SPHERES.link == link]) for link in np.unique(SPHERES.link)]
 
 
 def sphere_centers(q: npt.ArrayLike) -> Array:
     """Centres (..., N, 3) of `SPHERES` in the base frame [m] at joint angles (..., 6)."""
-    frames = ur5e.link_frames(q)[..., SPHERES.link, :, :]
-    return np.asarray(np.einsum("...nij,nj->...ni", frames[..., :3, :3], SPHERES.center) + frames[..., :3, 3])
+    return _in_base(ur5e.link_frames(q))
+
+
+def _in_base(frames: Array) -> Array:
+    """Centres (..., N, 3) of `SPHERES` [m] for the frames (..., 7, 4, 4) of the links, link by link."""
+    return np.concatenate(
+        [
+            center @ np.swapaxes(frames[..., link, :3, :3], -1, -2) + frames[..., None, link, :3, 3]
+            for link, center in _CENTERS_BY_LINK
+        ],
+        axis=-2,
+    )
 
 
 def box_distance(low: Array, high: Array, points: Array) -> npt.NDArray[np.float64]:
     """Distance [m] of points (..., 3) from the box between the corners `low` and `high` (3,); 0 inside."""
-    return np.asarray(np.linalg.norm(np.maximum(0.0, np.maximum(low - points, points - high)), axis=-1))
+    return _length(np.maximum(0.0, np.maximum(low - points, points - high)))
 
 
 def self_distance(centers: Array) -> npt.NDArray[np.float64]:
     """Smallest gap (...,) [m] between bodies that are not neighbours, of sphere centres (..., N, 3)."""
     return np.asarray(
         (
-            np.linalg.norm(centers[..., _PAIRS[0], :] - centers[..., _PAIRS[1], :], axis=-1)
+            _length(centers[..., _PAIRS[0], :] - centers[..., _PAIRS[1], :])
             - (SPHERES.radius[_PAIRS[0]] + SPHERES.radius[_PAIRS[1]])
         ).min(axis=-1)
     )
+
+
+def hand_distance(centers: Array, T_base_tcp: Array, load_m: float) -> npt.NDArray[np.float64]:
+    """Smallest gap (N,) [m] between the fingers with a load and the arm up to its forearm.
+
+    Args:
+        centers: sphere centres (N, M, 3).
+        T_base_tcp: poses (N, 4, 4) of the tcp.
+        load_m: how far a load reaches below the tcp; 0 without one.
+    """
+    along = np.linspace(-rg2.BODY_ABOVE_TIPS_M, load_m, _HAND_SPHERES)
+    hand = T_base_tcp[:, None, :3, 3] + along[:, None] * T_base_tcp[:, None, :3, 2]
+    arm = SPHERES.group <= _FOREARM
+    apart = _length(hand[:, :, None] - centers[:, None, arm])
+    return np.asarray((apart - _HAND_M - SPHERES.radius[arm]).min(axis=(1, 2)))
 
 
 def finger_points(T_base_tcp: Array, load_m: float) -> Array:
@@ -105,7 +150,71 @@ def finger_points(T_base_tcp: Array, load_m: float) -> Array:
     reach = rg2.CLOSED_LENGTH_M - rg2.PALM_M + load_m
     z = load_m - np.linspace(0.0, reach, int(reach / FINGER_SPACING_M) + 2)
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray(np.einsum("...ij,kj->...ki", T_base_tcp[..., :3, :3], grid) + T_base_tcp[..., None, :3, 3])
+    return np.asarray(grid @ np.swapaxes(T_base_tcp[..., :3, :3], -1, -2) + T_base_tcp[..., None, :3, 3])
+
+
+@dataclass(frozen=True)
+class ToolPoints:
+    """Small spheres that cover the gripper at one opening, and a load in it, in the frame of the tcp.
+
+    Attributes:
+        points: (N, 3) centres, tcp frame [m].
+        radius_m: of all of them.
+        body: (N,) True for the gripper's body, False for cranks, fingers and load.
+    """
+
+    points: Array
+    radius_m: float
+    body: npt.NDArray[np.bool_]
+
+
+# Radius of the small spheres. Their centres are at most 1.6 radii apart: they then cover a face up to 2 mm.
+TOOL_POINT_M = 0.008
+# A load reaches so far from the middle across the closing direction: the longest block is 100 mm.
+_LOAD_HALF_M = 0.050
+
+
+@lru_cache(maxsize=32)
+def tool_points(opening_m: float, load_m: float) -> ToolPoints:
+    """Spheres that cover the gripper's body, and fingers and load at an opening.
+
+    Args:
+        opening_m: between the finger tips, in the range of the gripper.
+        load_m: how far a load reaches below the tcp; 0 without one.
+    """
+    retracted = -rg2.tip_retraction(opening_m)
+    body_z = -rg2.BODY_ABOVE_TIPS_M
+    body = _box_points((-rg2.BODY_M[0], -rg2.BODY_M[1], body_z - 0.112), (rg2.BODY_M[0], rg2.BODY_M[1], body_z))
+    half, breadth = opening_m / 2, rg2.FINGER_BREADTH_M / 2
+    knuckle = retracted - rg2.KNUCKLE_TO_TIP_M
+    fingers = []
+    for side in (-1.0, 1.0):
+        inner, outer = sorted((side * half, side * (half + rg2.FINGER_THICKNESS_M)))
+        fingers.append(_box_points((inner, -breadth, knuckle), (outer, breadth, retracted)))
+        # The cranks, from the pivots behind the palm to the knuckles.
+        start = np.array([side * rg2.PIVOT_OFFSET_M, 0.0, -(rg2.CLOSED_LENGTH_M - rg2.PIVOTS_M)])
+        end = np.array([side * (half + rg2.FINGER_THICKNESS_M / 2), 0.0, knuckle])
+        along = np.linspace(0.0, 1.0, 5)[:, None] * (end - start) + start
+        fingers.extend(along + np.array([0.0, y, 0.0]) for y in (-rg2.CRANKS_M[1] / 2, rg2.CRANKS_M[1] / 2))
+    if load_m > 0:
+        fingers.append(_box_points((-half, -_LOAD_HALF_M, retracted), (half, _LOAD_HALF_M, load_m)))
+    points = np.concatenate([body, *fingers])
+    points.flags.writeable = False
+    return ToolPoints(points, TOOL_POINT_M, np.arange(len(points)) < len(body))
+
+
+def _box_points(low: tuple[float, float, float], high: tuple[float, float, float]) -> Array:
+    """Centres (N, 3) on the faces of a box, of spheres of `TOOL_POINT_M` that cover it."""
+    axes = []
+    for a, b in zip(low, high, strict=True):
+        inset = min(TOOL_POINT_M / 2, (b - a) / 2)
+        count = int(np.ceil((b - a - 2 * inset) / (1.6 * TOOL_POINT_M))) + 1
+        axes.append(np.linspace(a + inset, b - inset, count))
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    faces = np.zeros(len(grid), np.bool_)
+    for axis, values in enumerate(axes):
+        faces |= (grid[:, axis] == values[0]) | (grid[:, axis] == values[-1])
+    return np.asarray(grid[faces])
 
 
 def blocks_view(
@@ -114,8 +223,9 @@ def blocks_view(
     x_range: tuple[float, float],
     y_range: tuple[float, float],
     table_height_m: float,
+    load_m: float = 0.0,
 ) -> bool:
-    """Whether arm or gripper stand between a camera and a rectangle of the table.
+    """Whether arm, gripper or a load stand between a camera and a rectangle of the table.
 
     Args:
         q: joint angles (6,) [rad].
@@ -123,11 +233,12 @@ def blocks_view(
         x_range: of the rectangle, base frame [m].
         y_range: likewise.
         table_height_m: z of the table, base frame.
+        load_m: how far a load reaches from the tcp, down and to any side; 0 without one.
     """
     T_tcp = ur5e.forward(q) @ rg2.T_FLANGE_TCP
     fingers = finger_points(T_tcp, 0.0)
-    centers = np.concatenate([sphere_centers(q), fingers])
-    radii = np.concatenate([SPHERES.radius, np.full(len(fingers), FINGER_SPACING_M)])
+    centers = np.concatenate([sphere_centers(q), fingers, T_tcp[None, :3, 3]])
+    radii = np.concatenate([SPHERES.radius, np.full(len(fingers), FINGER_SPACING_M), [load_m]])
     below = centers[:, 2] < eye[2] - radii
     away = centers[below] - eye
     # Their shadows on the table, as if the camera were a lamp.
@@ -136,6 +247,12 @@ def blocks_view(
     size = radii[below] * stretch * np.linalg.norm(away, axis=1) / -away[:, 2]
     (x0, x1), (y0, y1) = x_range, y_range
     return bool(((x > x0 - size) & (x < x1 + size) & (y > y0 - size) & (y < y1 + size)).any())
+
+
+def _length(vectors: Array) -> Array:
+    """Lengths (...,) of vectors (..., 3); several times as fast as the general norm."""
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def _sphere_pairs() -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -33,6 +33,9 @@ PALM_M, PIVOTS_M = 0.128, 0.126
 # the body of the gripper likewise (public RG2 models, rounded).
 CRANKS_M, CRANKS_ABOVE_TIPS_M = (0.022, 0.012), CLOSED_LENGTH_M - PIVOTS_M - CRANK_LENGTH_M
 BODY_M, BODY_ABOVE_TIPS_M = (0.035, 0.024), CLOSED_LENGTH_M - PALM_M
+# A finger's knuckle above its tip; the outer crank's pivot from the middle (public RG2 models, rounded).
+KNUCKLE_TO_TIP_M = CLOSED_LENGTH_M - PIVOTS_M - CRANK_LENGTH_M * math.cos(CLOSED_ANGLE)
+PIVOT_OFFSET_M = 0.017
 # A finger tip, across the closing direction and along it. Measured from the public RG2 models.
 FINGER_BREADTH_M = 0.022
 FINGER_THICKNESS_M = 0.010

@@ -101,6 +101,16 @@ def inverse(T_base_flange: Array, q_near: npt.ArrayLike) -> Array | None:
     return turned if q is None or np.abs(turned - near).max() < np.abs(q - near).max() else q
 
 
+def inverse_all(T_base_flange: Array, q_near: npt.ArrayLike) -> Array:
+    """All joint angles (N, 6) [rad] that reach a flange pose, those nearest to `q_near` first.
+
+    Every solution is taken in the turn nearest to `q_near` that lies within the joint limits.
+    """
+    near = np.asarray(q_near, dtype=np.float64)
+    q = _within_limits(T_base_flange, near)
+    return np.asarray(q[np.argsort(np.abs(q - near).max(axis=1), kind="stable")])
+
+
 def inverse_along(T_base_flange: Array, q_start: npt.ArrayLike, max_step: float) -> Array:
     """Joint angles along a flange path, each nearest to the one before.
 
@@ -136,14 +146,17 @@ _TURN = 1e-3
 
 def _nearest(T_base_flange: Array, near: Array) -> Array | None:
     """The solver's solution within the joint limits that is nearest to `near` (6,), None if there is none."""
+    q = _within_limits(T_base_flange, near)
+    return np.asarray(q[np.argmin(np.abs(q - near).max(axis=1))]) if len(q) else None
+
+
+def _within_limits(T_base_flange: Array, near: Array) -> Array:
+    """The solver's solutions (N, 6) within the joint limits, each in its turn nearest to `near` (6,)."""
     solutions = analytic_ik.inverse_kinematics(np.ascontiguousarray(T_base_flange, dtype=np.float64))
     if not solutions:
-        return None
+        return np.empty((0, 6))
     q = np.asarray(solutions)
     q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi))
     q = np.where(q > JOINT_LIMIT, q - 2 * np.pi, q)
     q = np.where(q < -JOINT_LIMIT, q + 2 * np.pi, q)
-    q = q[(np.abs(q) <= JOINT_LIMIT).all(axis=1)]
-    if not len(q):
-        return None
-    return np.asarray(q[np.argmin(np.abs(q - near).max(axis=1))])
+    return np.asarray(q[(np.abs(q) <= JOINT_LIMIT).all(axis=1)])

@@ -12,40 +12,33 @@ from typing import TYPE_CHECKING
 
 from robotcell.errors import CellError, NoTarget, StorageError, UnsafeMotion
 from robotcell.io.atomic_file import make_folder
+from robotcell.jobs.choice import Choice, choose, task_for
 from robotcell.jobs.decision import Decision, Hold, Observer
-from robotcell.jobs.hidden_goal import uncover
 from robotcell.jobs.journal_tables import action_of, action_row, frame_row, outcome_row
-from robotcell.jobs.policy_api import Observation, PickAny, PickGoal, Uncover
+from robotcell.jobs.look_ahead import LookAhead
+from robotcell.jobs.policy_api import Observation
 from robotcell.jobs.progress import Progress
 from robotcell.jobs.resuming import check_resumable, cut_off, judge_resumed, replay, settle, task_of
 from robotcell.jobs.run_folder import load_frame, make_run_dir, save_frame
 from robotcell.jobs.verdict import Outcome, Result, judge
-from robotcell.motion.actions import plan_action
 from robotcell.motion.config_check import check_config
-from robotcell.motion.executor import Ending
+from robotcell.motion.executor import Ending, Execution
 from robotcell.motion.grasp import Grasp
-from robotcell.motion.path_check import check_path
 from robotcell.motion.retreat import at_home
-from robotcell.perception.goals import find_goal
-from robotcell.perception.view import view_of
+from robotcell.motion.way import plan_way
+from robotcell.perception.view import view_blocked, view_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import numpy as np
-    import numpy.typing as npt
-
     from robotcell.cell import Cell
     from robotcell.jobs.journal import Journal, Metrics
     from robotcell.jobs.journal_tables import ActionRow
-    from robotcell.jobs.policy_api import Policy, Task
-    from robotcell.motion.actions import Action
+    from robotcell.jobs.policy_api import Policy
     from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.view import View
 
-# Paper, section "The problem": at most 5 pushes in a row for one goal; "Evaluation": 10 consecutive failed
-# attempts end a run.
-MAX_PUSHES_IN_A_ROW = 5
+# Paper, "Evaluation": 10 consecutive failed attempts end a run.
 MAX_FAILURES_IN_A_ROW = 10
 # Exit codes of commands that a signal ends, in words.
 _ENDED_BY = {129: "the terminal was closed", 143: "terminated"}
@@ -63,19 +56,22 @@ class Report:
     cell_s: float
 
 
-def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, CheckedPlan]:
-    """Look, decide, plan and check one action; nothing moves.
+def preview(cell: Cell, policy: Policy, goal: str | None) -> tuple[Decision, CheckedPlan | UnsafeMotion]:
+    """Look, decide, plan and check one action; nothing moves. A plan that is refused comes as the refusal.
 
     Raises:
-        ConfigError, NoTarget, UnsafeMotion: as in a job.
+        ConfigError, NoTarget: as in a job.
         ConnectionLost, DeviceFault, CalibrationError: as `Cell.look`.
     """
     check_config(cell.config)
     view = cell.look(policy.workspace)
-    task = _task(view, goal, None)
-    action = policy.decide(_observe(view, task, (), may_push=True))
-    plan = plan_action(action, view.heightmap, cell.arm.state().q, cell.config)
-    return Decision(1, goal, view, task, action), check_path(plan, cell.config)
+    task = task_for(view, goal, None)
+    action = policy.decide(Observation(view.heightmap, view.segmentation.labels, task))
+    decision = Decision(1, goal, view, task, action)
+    try:
+        return decision, plan_way(action, view.heightmap, view.clearance, cell.arm.state().q, cell.config)
+    except UnsafeMotion as refusal:
+        return decision, refusal
 
 
 def run_job(
@@ -154,6 +150,14 @@ def resume_job(
     return job.run(lambda: job.pick_up(row.actions))
 
 
+@dataclass(frozen=True)
+class _Ahead:
+    """What was thought out while an action still ran: its result, as far as the camera tells, and what is next then."""
+
+    result: Result
+    choice: Choice | NoTarget | None
+
+
 @dataclass
 class _Job:
     cell: Cell
@@ -175,6 +179,7 @@ class _Job:
             for observer in self.observers:
                 observer.started(self.job_id, self.run_dir)
             reason = self.work(start())
+            self.go_home()
         except BaseException as error:
             # What stopped the job says more than a journal that cannot be told of it.
             with suppress(StorageError):
@@ -189,9 +194,13 @@ class _Job:
 
     def start(self) -> View:
         """Go home from wherever the arm stands, and look."""
+        self.go_home()
+        return self._look()
+
+    def go_home(self) -> None:
+        """Go home, unless the arm is there."""
         if not at_home(self.cell.arm.state(), self.cell.config):
             self.cell.home()
-        return self._look()
 
     def pick_up(self, rows: Sequence[ActionRow]) -> View:
         """Settle what was cut off, look, and be where the job was."""
@@ -218,37 +227,53 @@ class _Job:
 
     def work(self, view: View) -> str:
         """Act until everything is picked; "" or why it was given up."""
+        ahead: _Ahead | None = None
         while True:
-            if self.goals is None:
-                goal, done = None, not view.segmentation.instances
-            else:
-                done = self.progress.goals == len(self.goals)
-                goal = None if done else self.goals[self.progress.goals]
-            if done:
+            if self.hold is not None and not self._done(view, self.progress) and self.hold():
+                view, ahead = self._look(), None
+            choice = self._choose(view, self.progress) if ahead is None else ahead.choice
+            if choice is None:
                 return ""
-            if self.hold is not None and self.hold():
-                view = self._look()
-            try:
-                task = _task(view, goal, self.progress.place)
-                may_push = self.progress.pushes < MAX_PUSHES_IN_A_ROW or isinstance(task, Uncover)
-                action = self.policy.decide(_observe(view, task, self.progress.barred, may_push=may_push))
-            except NoTarget as error:
-                return str(error)
-            view, outcome = self._act(goal, view, task, action)
-            self.progress = self.progress.after(goal, task, action, outcome, view.heightmap.workspace)
+            if isinstance(choice, NoTarget):
+                return str(choice)
+            goal = self._goal(self.progress)
+            view, outcome, ahead = self._act(goal, view, choice)
+            workspace = view.heightmap.workspace
+            self.progress = self.progress.after(goal, choice.task, choice.action, outcome, workspace)
             if self.progress.failures >= MAX_FAILURES_IN_A_ROW:
                 failures = self.progress.failures
                 return f"given up after {failures} failed attempts in a row, the last one: {outcome.detail}"
+            if ahead is not None and ahead.result is not outcome.result:
+                ahead = None
+
+    def _done(self, view: View, progress: Progress) -> bool:
+        if self.goals is None:
+            return not view.segmentation.instances
+        return progress.goals == len(self.goals)
+
+    def _goal(self, progress: Progress) -> str | None:
+        return None if self.goals is None else self.goals[progress.goals]
+
+    def _choose(self, view: View, progress: Progress) -> Choice | NoTarget | None:
+        """What to do next; why nothing can be done; or None where nothing is left to do."""
+        if self._done(view, progress):
+            return None
+        return choose(self.policy, view, self._goal(progress), progress)
 
     def _look(self) -> View:
-        view = self.cell.look(self.policy.workspace)
+        if view_blocked(self.cell.devices, self.cell.config, self.policy.workspace):
+            self.go_home()
+        return self._seen(self.cell.look(self.policy.workspace))
+
+    def _seen(self, view: View) -> View:
         for observer in self.observers:
             observer.looked(view)
         return view
 
-    def _act(self, goal: str | None, view: View, task: Task, action: Action) -> tuple[View, Outcome]:
-        """Run one action between its two rows of the journal; the view after it."""
+    def _act(self, goal: str | None, view: View, choice: Choice) -> tuple[View, Outcome, _Ahead | None]:
+        """Run one action between its two rows of the journal; the view after it, and what was thought out meanwhile."""
         self.actions += 1
+        task, action = choice.task, choice.action
         decision = Decision(self.actions, goal, view, task, action)
         frame_id = self.journal.add_frame(
             frame_row(self.job_id, view.frame, view.heightmap, save_frame(view.frame, self.run_dir))
@@ -259,7 +284,7 @@ class _Job:
         for observer in self.observers:
             observer.decided(decision)
         try:
-            after, outcome = self._run(action_id, decision)
+            after, outcome, ahead = self._run(action_id, decision)
         except BaseException as error:
             stopped = Outcome(Result.STOPPED, None, _describe(error), float("nan"), float("nan"))
             # An action without an outcome is one that was cut off: the stop itself says more.
@@ -267,7 +292,7 @@ class _Job:
                 self._end_action(action_id, decision, stopped)
             raise
         self._end_action(action_id, decision, outcome)
-        return after, outcome
+        return after, outcome, ahead
 
     def _end_action(self, action_id: int, decision: Decision, outcome: Outcome) -> None:
         try:
@@ -277,38 +302,46 @@ class _Job:
             for observer in self.observers:
                 observer.ended(decision, outcome)
 
-    def _run(self, action_id: int, decision: Decision) -> tuple[View, Outcome]:
+    def _run(self, action_id: int, decision: Decision) -> tuple[View, Outcome, _Ahead | None]:
         cell, view = self.cell, decision.view
         try:
-            plan = plan_action(decision.action, view.heightmap, cell.arm.state().q, cell.config)
-            checked = check_path(plan, cell.config)
+            checked = self._plan(decision)
         except UnsafeMotion as error:
-            return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan"))
-        execution = cell.executor.run(checked, lambda label: self.journal.held(action_id, label))
-        if execution.ending is not Ending.DONE:
-            cell.home()
-        after = self._look()
-        return after, judge(decision.action, decision.goal, view, after, execution)
+            return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan")), None
+        with LookAhead(cell, self.policy.workspace, lambda after: self._think(decision, after)) as looking:
+            execution = cell.executor.run(checked, lambda label: self.journal.held(action_id, label), looking.poll)
+            seen = looking.result() if execution.ending is Ending.DONE else None
+        if seen is not None:
+            after, ahead = self._seen(seen[0]), seen[1]
+        else:
+            if execution.ending is not Ending.DONE:
+                cell.home(view.clearance)
+            after, ahead = self._look(), None
+        return after, judge(decision.action, decision.goal, view, after, execution), ahead
 
+    def _plan(self, decision: Decision) -> CheckedPlan:
+        """The plan of an action from where the arm stands; where there is none from there, from home.
 
-def _task(view: View, goal: str | None, place: npt.NDArray[np.bool_] | None) -> Task:
-    """What is to be done next; `place` (H, W) is where a goal may be that is not seen any more.
+        Raises:
+            UnsafeMotion: there is none from home either, where the arm then stands.
+        """
+        cell, view = self.cell, decision.view
+        while True:
+            state = cell.arm.state()
+            try:
+                return plan_way(decision.action, view.heightmap, view.clearance, state.q, cell.config)
+            except UnsafeMotion:
+                if at_home(state, cell.config):
+                    raise
+            cell.home(view.clearance)
 
-    Raises:
-        NoTarget: the goal is not on the table, or nothing can be done to uncover it.
-    """
-    if goal is None:
-        return PickAny()
-    try:
-        return PickGoal(view.segmentation.mask(find_goal(view.segmentation, goal)))
-    except NoTarget:
-        if place is None:
-            raise
-        return uncover(view, place)
-
-
-def _observe(view: View, task: Task, barred: tuple[Action, ...], *, may_push: bool) -> Observation:
-    return Observation(view.heightmap, view.segmentation.labels, task, barred, may_push)
+    def _think(self, decision: Decision, view: View) -> _Ahead:
+        """What is next, if the action under way ends as planned. Runs beside the motion and touches no device."""
+        as_planned = Execution(Ending.DONE, "", 0.0, float("nan"), float("nan"))
+        outcome = judge(decision.action, decision.goal, decision.view, view, as_planned)
+        workspace = view.heightmap.workspace
+        progress = self.progress.after(decision.goal, decision.task, decision.action, outcome, workspace)
+        return _Ahead(outcome.result, self._choose(view, progress))
 
 
 def _describe(error: BaseException) -> str:

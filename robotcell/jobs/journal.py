@@ -68,6 +68,7 @@ class Journal:
 
     def __init__(self, url: str | Path) -> None:
         shown = str(url)
+        self._file: Path | None = None
         try:
             parsed = URL.create("sqlite", database=str(url)) if isinstance(url, Path) else make_url(url)
             # A URL may hold a password.
@@ -79,7 +80,8 @@ class Journal:
         try:
             if parsed.get_backend_name() == "sqlite":
                 if parsed.database not in {None, "", ":memory:"}:
-                    Path(str(parsed.database)).parent.mkdir(parents=True, exist_ok=True)
+                    self._file = Path(str(parsed.database))
+                    self._file.parent.mkdir(parents=True, exist_ok=True)
                 event.listen(self._engine, "connect", _use_write_ahead_log)
             bring_up_to_date(self._engine)
         except BaseException as error:
@@ -239,6 +241,11 @@ class Journal:
 
     @contextmanager
     def _writing(self) -> Iterator[Session]:
+        if self._file is not None and not self._file.exists():
+            # SQLite would go on writing into a file that nobody can open any more.
+            raise StorageError(
+                f"the journal cannot be written: {self._file} was removed; put it back, then start again"
+            )
         try:
             with Session(self._engine, expire_on_commit=False) as session, session.begin():
                 yield session

@@ -148,7 +148,7 @@ class OutcomeRow(Base):
     detail: Mapped[str]
     # Largest contact force of guarded motions; null where it is not known.
     peak_force_n: Mapped[float | None]
-    # Largest contact force while the fingers moved; null where it is not known.
+    # Largest contact force while the fingers gripped; null where they did not, or it is not known.
     grip_force_n: Mapped[float | None]
     # Time of the end on the cell's clock [s].
     ended_s: Mapped[float]

@@ -14,13 +14,17 @@ from robotcell.errors import StorageError
 from robotcell.geometry import rg2
 from robotcell.io.images import write_image
 from robotcell.jobs.policy_api import PickAny
+from robotcell.jobs.swept_picture import draw_obstruction, draw_plan
+from robotcell.motion.clearance import Obstructed
 from robotcell.motion.grasp import Grasp
+from robotcell.motion.path_check import CheckedPlan
 from robotcell.perception.heightmap import Heightmap, build_heightmap
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from robotcell.config import CellConfig
+    from robotcell.errors import UnsafeMotion
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
@@ -102,6 +106,20 @@ def draw_decision(
     """A page (H, W, 3) uint8 RGB of a decision: camera view, heightmap with the action, heights."""
     goal = None if isinstance(decision.task, PickAny) else decision.task.mask
     return draw_view(decision.view, decision.action, goal, config, caption, color)
+
+
+def draw_preview(decision: Decision, plan: CheckedPlan | UnsafeMotion, config: CellConfig, caption: str) -> _Picture:
+    """The page of a decision, and beside it what its plan sweeps, or what stands in its way (H, W, 3) uint8 RGB."""
+    page = draw_decision(decision, config, caption, _NEUTRAL if isinstance(plan, CheckedPlan) else _BAD)
+    seen = decision.view.clearance
+    if isinstance(plan, CheckedPlan):
+        panel = draw_plan(plan, seen, _PANEL_PX)
+    elif isinstance(plan, Obstructed):
+        panel = draw_obstruction(plan.obstruction, plan.q, seen, _PANEL_PX)
+    else:
+        return page
+    strip = np.broadcast_to(page[:1, :1], (_CAPTION_PX, panel.shape[1], 3))
+    return np.hstack([page, np.vstack([strip, panel])])
 
 
 def draw_view(

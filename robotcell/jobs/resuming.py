@@ -96,7 +96,9 @@ def settle(cell: Cell, grasp: Grasp | None, held: Callable[[str], None] | None) 
             "hand, then resume",
             device="gripper",
         )
-    execution = cell.executor.run(check_path(plan_carry(grasp, cell.arm.state().q, config), config), held)
+    execution = cell.executor.run(
+        check_path(plan_carry(grasp, cell.arm.state().q, config), config), held or (lambda _: None)
+    )
     if execution.ending is not Ending.DONE:
         cell.home()
     return execution

@@ -46,7 +46,8 @@ def check_config(config: CellConfig) -> None:
         check_poses(home[None], 0.0, obstacles(config), config, "motion.home_q", config.gripper.tip_clearance_m)
     except UnsafeMotion as error:
         problems.append(str(error))
-    if blocks_view(home, config.camera.pose()[:3, 3], config.workspace.x, config.workspace.y, config.table.height_m):
+    eye, space = config.camera.pose()[:3, 3], config.workspace
+    if blocks_view(home, eye, space.x, space.y, config.table.height_m):
         problems.append("motion.home_q: the arm would stand between the camera and the workspace")
     z = config.table.height_m + motion.approach_m
     corners = {f"workspace, corner x {x}, y {y}": (x, y) for x, y in product(config.workspace.x, config.workspace.y)}

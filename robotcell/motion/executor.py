@@ -12,16 +12,18 @@ import numpy as np
 
 from robotcell.errors import CellError, DeviceFault, GuardTripped
 from robotcell.geometry.transforms import rotation_angle
+from robotcell.interfaces import JointWaypoint, LinearWaypoint
 from robotcell.motion.guard import Guard, Latch
-from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove
+from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, Shape, blended
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
-    from robotcell.interfaces import Devices
+    from robotcell.interfaces import Devices, Waypoint
     from robotcell.motion.path_check import CheckedPlan
+    from robotcell.motion.plan import Step
 
 # 125 Hz: the slower of the two rates at which UR controllers report.
 PERIOD_S = 0.008
@@ -56,7 +58,7 @@ class Execution:
         ending: how it ended.
         step: label of the step that ended it.
         peak_force_n: largest contact force during guarded motions, and of the grip that ended it.
-        grip_force_n: largest contact force while the fingers moved; NaN if they never did.
+        grip_force_n: largest contact force while the fingers gripped; NaN if they never did.
         width_m: opening of the fingers at the last check for a held object; NaN without one.
     """
 
@@ -80,16 +82,25 @@ class Executor:
         self._devices = devices
         self._latch = latch
         self._guard = Guard(config, latch)
+        self._beside: Callable[[], None] = lambda: None
 
-    def run(self, checked: CheckedPlan, held: Callable[[str], None] | None = None) -> Execution:
+    def run(
+        self,
+        checked: CheckedPlan,
+        held: Callable[[str], None] = lambda _: None,
+        beside: Callable[[], None] = lambda: None,
+    ) -> Execution:
         """Run a plan to its end, or to the first contact or empty grip.
 
         Args:
             checked: the plan.
-            held: called with the label of each `CheckHold` that something was held at, before the next step.
+            held: called, while the arm stands, with the label of each `CheckHold` that something was held at.
+            beside: is called in every supervision period once the last guarded motion and grip are over; it must return
+                at once.
 
-        However this ends, by an exception or by an interrupt as well, arm and fingers stand still afterwards, and
-        whatever ended it early is latched.
+        However this ends, by an exception or by an interrupt as well, the arm stands still afterwards, and whatever
+        ended it early is latched. So do the fingers, but for those of a `Shape` at the end of the plan, which go on to
+        where they were sent.
 
         Raises:
             GuardTripped, DeviceFault, ConnectionLost, UnsafeMotion: as the guard and the devices do.
@@ -97,7 +108,7 @@ class Executor:
         plan = checked.plan
         self._guard.check_start(self._devices.arm.state(), self._devices.clock.now(), plan)
         try:
-            return self._run_steps(checked, held)
+            return self._run_steps(checked, held, beside)
         except BaseException as error:
             self._latch.trip(f"{plan.label} was cut short: {error if str(error) else type(error).__name__}")
             self._stop()
@@ -111,66 +122,96 @@ class Executor:
             return self._devices.arm.state().q
         return None
 
-    def _run_steps(self, checked: CheckedPlan, held: Callable[[str], None] | None) -> Execution:
+    def _run_steps(self, checked: CheckedPlan, held: Callable[[str], None], beside: Callable[[], None]) -> Execution:
+        steps, lowest = checked.plan.steps, checked.lowest_tip_m
         peak_force, grip_force, width = 0.0, math.nan, math.nan
-        ending, label = Ending.DONE, ""
-        for step, path in zip(checked.plan.steps, checked.joint_paths, strict=True):
+        ending, label, shaping = Ending.DONE, "", False
+        touching = max((i for i, step in enumerate(steps) if isinstance(step, Grip) or not _free(step)), default=-1)
+        for group in blended(steps):
+            step = steps[group[0]]
             label = step.label
+            self._beside = beside if group[0] > touching else lambda: None
+            if shaping and (isinstance(step, Grip | CheckHold) or not _free(step)):
+                self._fingers_move(lowest)
+                shaping = False
             if isinstance(step, CheckHold):
                 width = self._devices.gripper.state().width_m
                 if width < step.min_width_m:
                     ending = Ending.EMPTY
-                    break
-                if held is not None:
+                else:
                     held(label)
-                continue
-            if isinstance(step, Grip):
-                contact, force = self._grip(step, checked.lowest_tip_m)
+            elif isinstance(step, Shape):
+                self._shape(step, lowest)
+                shaping = True
+            elif isinstance(step, Grip):
+                contact, force = self._grip(step, lowest)
                 grip_force = force if math.isnan(grip_force) else max(grip_force, force)
-                peak_force = max(peak_force, force) if contact else peak_force
+                if contact:
+                    ending, peak_force = Ending.CONTACT, max(peak_force, force)
             else:
-                contact, force = self._move(step, path, checked.lowest_tip_m)
-                peak_force = max(peak_force, force)
-            if contact:
-                ending = Ending.CONTACT
+                ending, label, force, held_m = self._move(checked, group)
+                peak_force, width = max(peak_force, force), width if math.isnan(held_m) else held_m
+                # Told here, not as the arm passes the corner: a journal takes longer than a period.
+                passed = [steps[i].label for i in group if isinstance(steps[i], CheckHold) and steps[i].label != label]
+                for check in passed if ending is Ending.DONE else ():
+                    held(check)
+            if ending is not Ending.DONE:
                 break
         return Execution(ending, label, peak_force, grip_force, width)
 
-    def _move(self, step: JointMove | LinearMove, path: Array, lowest_tip_m: float) -> tuple[bool, float]:
-        """Run one motion, checked as path (N, 6) [rad]; whether a guarded one met something, and its peak force [N]."""
+    def _move(self, checked: CheckedPlan, group: tuple[int, ...]) -> tuple[Ending, str, float, float]:
+        """Run one motion, of one step or of several that are blended, with the checks for a held object between them.
+
+        Returns:
+            How it ended and at which step, the peak force of a guarded one [N], and the opening of the fingers at the
+            last check; NaN without one.
+        """
         arm = self._devices.arm
-        contact_force = step.contact_force_n if isinstance(step, LinearMove) else None
+        moves = [step for i in group if isinstance(step := checked.plan.steps[i], JointMove | LinearMove)]
+        last, path = moves[-1], np.vstack([checked.joint_paths[i] for i in group])
+        # How many samples of the path each check comes after.
+        lengths = np.cumsum([len(checked.joint_paths[i]) for i in group])
+        checks = [(int(lengths[k]), checked.plan.steps[i]) for k, i in enumerate(group)]
+        holds = [(after, step) for after, step in checks if isinstance(step, CheckHold)]
+        contact_force = last.contact_force_n if isinstance(last, LinearMove) else None
         # Force sensors drift, so contact is judged against the force before the motion.
         wrench_before = arm.state().wrench
-        if isinstance(step, JointMove):
-            arm.start_joints(step.q, step.speed_rad_s, step.acceleration_rad_s2)
-        else:
-            arm.start_linear(step.T_base_tcp, step.speed_m_s, step.acceleration_m_s2)
-        peak, contact = 0.0, False
+        arm.start_path([waypoint(move) for move in moves])
+        peak, width, passed = 0.0, math.nan, 0
+        ending, label = Ending.DONE, last.label
         moved_at, q_moved = self._devices.clock.now(), arm.state().q
-        while arm.moving:
+        moving = True
+        while moving:
+            moving = arm.moving
             state, now = arm.state(), self._devices.clock.now()
-            self._guard.check(state, now, lowest_tip_m)
+            self._guard.check(state, now, checked.lowest_tip_m)
             if float(np.abs(state.q - q_moved).max()) > _STILL_RAD:
                 moved_at, q_moved = now, state.q
             elif now - moved_at > _STALL_S:
                 raise GuardTripped(
-                    f"step {step.label!r} stood still for {_STALL_S:.0f} s: check the speed slider and that the "
+                    f"step {label!r} stood still for {_STALL_S:.0f} s: check the speed slider and that the "
                     "program is not paused, look at the cell, then recover"
                 )
-            if contact_force is not None and not contact:
+            if contact_force is not None and ending is Ending.DONE:
                 force = float(np.linalg.norm((state.wrench - wrench_before)[:3]))
                 peak = max(peak, force)
                 if force > contact_force:
-                    contact = True
+                    ending = Ending.CONTACT
                     arm.stop()
-            arm.kick()
-            self._devices.clock.sleep(PERIOD_S)
-        state = arm.state()
-        self._guard.check(state, self._devices.clock.now(), lowest_tip_m)
-        if not contact:
-            self._check_reached(step, path[-1], state.q, state.T_base_tcp)
-        return contact, peak
+            passed = _follow(path, passed, state.q) if moving else len(path)
+            while holds and ending is Ending.DONE and passed >= holds[0][0]:
+                width, check = self._devices.gripper.state().width_m, holds.pop(0)[1]
+                if width < check.min_width_m:
+                    ending, label = Ending.EMPTY, check.label
+                    arm.stop()
+            if moving:
+                arm.kick()
+                self._beside()
+                self._devices.clock.sleep(PERIOD_S)
+        if ending is Ending.DONE:
+            state = arm.state()
+            self._check_reached(last, path[-1], state.q, state.T_base_tcp)
+        return ending, label, peak, width
 
     def _check_reached(self, step: JointMove | LinearMove, q_end: Array, q: Array, T_base_tcp: Array) -> None:
         if isinstance(step, JointMove):
@@ -222,6 +263,30 @@ class Executor:
             clock.sleep(PERIOD_S)
         return False, peak
 
+    def _shape(self, step: Shape, lowest_tip_m: float) -> None:
+        """Send the fingers off, and wait until their opening has changed by what the step asks for."""
+        gripper = self._devices.gripper
+        before = gripper.state().width_m
+        gripper.start_width(step.width_m, step.force_n)
+        if step.clear_m > 0:
+            self._fingers_move(lowest_tip_m, lambda: abs(gripper.state().width_m - before) >= step.clear_m)
+
+    def _fingers_move(self, lowest_tip_m: float, enough: Callable[[], bool] = lambda: False) -> None:
+        """Watch the standing arm until the fingers have come to rest, or far enough."""
+        arm, gripper, clock = self._devices.arm, self._devices.gripper, self._devices.clock
+        deadline = clock.now() + _GRIP_TIMEOUT_S
+        while gripper.state().busy and not enough():
+            self._guard.check(arm.state(), clock.now(), lowest_tip_m)
+            arm.kick()
+            self._beside()
+            if clock.now() > deadline:
+                raise DeviceFault(
+                    f"the gripper was still busy after {_GRIP_TIMEOUT_S:.0f} s; power-cycle it at the Compute Box, "
+                    "then recover",
+                    device="gripper",
+                )
+            clock.sleep(PERIOD_S)
+
     def _stop(self) -> None:
         """Stop arm and fingers and wait for standstill; an arm that is lost is stopped by its own controller."""
         arm, gripper, clock = self._devices.arm, self._devices.gripper, self._devices.clock
@@ -235,3 +300,22 @@ class Executor:
             while arm.moving and clock.now() < deadline:
                 arm.kick()
                 clock.sleep(PERIOD_S)
+
+
+def _free(step: Step) -> bool:
+    """Whether nothing may be touched during a motion; True for what is no motion."""
+    return not (isinstance(step, LinearMove) and step.contact_force_n is not None)
+
+
+def waypoint(move: JointMove | LinearMove) -> Waypoint:
+    """What the arm is told of a motion."""
+    if isinstance(move, JointMove):
+        return JointWaypoint(move.q, move.speed_rad_s, move.acceleration_rad_s2, move.blend_m)
+    return LinearWaypoint(move.T_base_tcp, move.speed_m_s, move.acceleration_m_s2, move.blend_m)
+
+
+def _follow(path: Array, passed: int, q: Array) -> int:
+    """How many samples of a path (N, 6) lie behind joint angles (6,) that were nearest to number `passed` before."""
+    while passed + 1 < len(path) and np.abs(q - path[passed + 1]).max() <= np.abs(q - path[passed]).max():
+        passed += 1
+    return passed

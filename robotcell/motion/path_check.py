@@ -5,6 +5,7 @@ It adds to the safety settings of the controller and never replaces them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,17 +15,25 @@ import numpy.typing as npt
 from robotcell.config.surroundings import obstacles
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, rg2, ur5e
+from robotcell.geometry.rounded_path import round_corners
 from robotcell.geometry.transforms import Array, check_transform, interpolate_transforms, rotation_angle
-from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.clearance import Tool, check_clearance
+from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan, Shape, blended
 from robotcell.motion.tool import flange_pose
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from robotcell.config import CellConfig, KeepOut
+    from robotcell.motion.plan import Step
+    from robotcell.perception.clearance_map import ClearanceMap
 
 # Distance between the samples of a checked path. A joint step of 0.04 rad moves the outstretched tcp by 40 mm.
 _JOINT_STEP_RAD = 0.04
 _LINEAR_STEP_M = 0.01
 _ROTATION_STEP_RAD = 0.05
+# On a rounded corner, which is short: the radius is a few centimetres.
+_CORNER_SAMPLES = 9
 # Two neighbouring samples of a straight path whose joints differ by more lie across a singularity.
 _MAX_JOINT_JUMP_RAD = 0.35
 # Rounding of positions that lie on a limit.
@@ -39,8 +48,8 @@ class CheckedPlan:
 
     Attributes:
         plan: as it was checked.
-        joint_paths: for each step the joint angles (N, 6) [rad] along it, from its start to its end; (1, 6) for a step
-            during which the arm stands.
+        joint_paths: for each step the joint angles (N, 6) [rad] along it, from its start to its end, or from the middle
+            of a rounded corner to the middle of the next one; (1, 6) for a step that moves no joint.
         lowest_tip_m: height above the table that the finger tips may go down to [m].
     """
 
@@ -49,43 +58,145 @@ class CheckedPlan:
     lowest_tip_m: float
 
 
-def check_path(plan: MotionPlan, config: CellConfig, *, lowest_tip_m: float | None = None) -> CheckedPlan:
+def check_path(
+    plan: MotionPlan, config: CellConfig, seen: ClearanceMap | None = None, *, lowest_tip_m: float | None = None
+) -> CheckedPlan:
     """Check every step of a plan against every limit, from the joint angles it starts at.
 
     Reach, joint limits, singularities on straight lines, speeds, the box of the tcp, keep-outs, the table, the arm
-    itself and the gripper's range; with the load where one is held. Where the arm stands at the start is a fact, not a
-    plan: only where it goes is checked, so that it can leave a place that it should not be in.
+    itself and the gripper's range; with the load where one is held; and what the camera saw. Where the arm stands at
+    the start is a fact, not a plan: only where it goes is checked, so that it can leave a place that it should not be
+    in.
 
     Args:
         plan: to be checked.
         config: of the cell, with its limits.
+        seen: what may stand on the table; without it nobody looked, and only furniture is known.
         lowest_tip_m: height above the table that the finger tips may go down to [m], below it where negative;
             gripper.tip_clearance_m of the cell unless given.
 
     Raises:
-        UnsafeMotion: the first violation, with the step, the place and the limit.
+        Obstructed: something that the camera saw, or may have overlooked, stands in the way.
+        UnsafeMotion: the first other violation, with the step, the place and the limit.
     """
     lowest = config.gripper.tip_clearance_m if lowest_tip_m is None else lowest_tip_m
     q = _joint_vector(plan.q_start, f"{plan.label}: start")
-    boxes = obstacles(config)
     paths: list[Array] = []
-    for step in plan.steps:
-        name = f"{plan.label}, step {step.label!r}"
-        path = q[None]
-        if isinstance(step, Grip):
-            _check_grip(step, name)
-        elif isinstance(step, JointMove | LinearMove):
-            path = (
-                joint_path(q, step, config, name)
-                if isinstance(step, JointMove)
-                else _linear_path(q, step, config, name)
-            )
-            check_poses(path[1:], step.load_m, boxes, config, name, lowest)
-        elif not isinstance(step, CheckHold):
-            raise TypeError(f"{name}: {type(step).__name__} is no step of a plan")
-        paths.append(path)
-        q = path[-1]
+    with_tools = tools(plan)
+    for group in blended(plan.steps):
+        legs: dict[int, Array] = {}
+        for i in group:
+            legs[i] = _leg(q, plan.steps[i], config, f"{plan.label}, step {plan.steps[i].label!r}")
+            q = legs[i][-1]
+        for i, path in _rounded(legs, plan).items():
+            name = f"{plan.label}, step {plan.steps[i].label!r}"
+            # An arm that does not round a corner comes to the corner itself.
+            _check_driven(path, legs[i][-1:], plan.steps[i], with_tools[i], config, seen, name, lowest)
+            paths.append(path)
     return CheckedPlan(plan, tuple(paths), lowest)
+
+
+def check_step(
+    q: Array, step: Step, tool: Tool, config: CellConfig, seen: ClearanceMap | None, name: str, lowest_tip_m: float
+) -> Array:
+    """Joint angles (N, 6) [rad] along one step from q (6,) to its target, checked as `check_path` does.
+
+    Args:
+        q: where it starts.
+        step: to be checked; its corners are not rounded.
+        tool: on the flange meanwhile.
+        config: of the cell.
+        seen: what may stand on the table; None if nobody looked.
+        name: of the step, for the error.
+        lowest_tip_m: height above the table that the finger tips may go down to.
+
+    Raises:
+        UnsafeMotion: as `check_path`.
+    """
+    path = _leg(q, step, config, name)
+    _check_driven(path, path[-1:], step, tool, config, seen, name, lowest_tip_m)
+    return path
+
+
+def _leg(q: Array, step: Step, config: CellConfig, name: str) -> Array:
+    """Joint angles (N, 6) along one step from q (6,); (1, 6) where the arm stands. Speeds and ranges are checked."""
+    if isinstance(step, Grip | Shape):
+        _check_grip(step, name)
+        return q[None]
+    if isinstance(step, CheckHold):
+        return q[None]
+    if isinstance(step, JointMove):
+        return joint_path(q, step, config, name)
+    if isinstance(step, LinearMove):
+        return linear_path(q, step, config, name)
+    raise TypeError(f"{name}: {type(step).__name__} is no step of a plan")
+
+
+def _check_driven(
+    path: Array,
+    end: Array,
+    step: Step,
+    tool: Tool,
+    config: CellConfig,
+    seen: ClearanceMap | None,
+    name: str,
+    lowest_tip_m: float,
+) -> None:
+    """Check the path (N, 6) of a motion and its target (1, 6), where it has one."""
+    if not isinstance(step, JointMove | LinearMove):
+        return
+    poses = np.concatenate([path[1:], end])
+    check_poses(poses, step.load_m, obstacles(config), config, name, lowest_tip_m)
+    if seen is not None:
+        check_clearance(path, tool, seen, config, name)
+        check_clearance(np.concatenate([path[-1:], end]), tool, seen, config, name)
+
+
+def _rounded(legs: dict[int, Array], plan: MotionPlan) -> dict[int, Array]:
+    """The path of each step of a blended group with its corners rounded, of the legs between their targets."""
+    moves = {i: step for i in legs if isinstance(step := plan.steps[i], JointMove | LinearMove)}
+    if len(moves) < 2:
+        return legs
+    blends = [move.blend_m for move in moves.values()]
+    path = round_corners([legs[i] for i in moves], blends, rg2.T_FLANGE_TCP, _CORNER_SAMPLES)
+    driven = {i: path.q[path.leg == number] for number, i in enumerate(moves)}
+    result: dict[int, Array] = {}
+    for i in legs:
+        # A check in a corner is made in its middle.
+        result[i] = driven[i] if i in driven else result[i - 1][-1:]
+    return result
+
+
+def tools(plan: MotionPlan) -> list[Tool]:
+    """What hangs on the flange during each step of a plan.
+
+    Fingers that closed on a load are taken to be as wide as they were before; at the start they may be wide open. Those
+    that move beside a motion may be as wide as before or as they will be.
+    """
+    result: list[Tool] = []
+    opening = held = rg2.MAX_WIDTH_M
+    shaped = math.nan
+    for step in plan.steps:
+        if not math.isnan(shaped) and (
+            isinstance(step, Grip | CheckHold) or (isinstance(step, LinearMove) and step.contact_force_n is not None)
+        ):
+            # The fingers are waited for.
+            opening, shaped = shaped, math.nan
+        if isinstance(step, Grip):
+            result.append(Tool(max(opening, min(step.width_m, rg2.MAX_WIDTH_M))))
+            held = max(opening, step.width_m)
+            opening = step.width_m
+        elif isinstance(step, Shape):
+            opening = held = max(opening, step.width_m)
+            shaped = step.width_m
+            result.append(Tool(min(opening, rg2.MAX_WIDTH_M)))
+        elif isinstance(step, JointMove):
+            result.append(Tool(held if step.load_m > 0 else opening, step.load_m))
+        elif isinstance(step, LinearMove):
+            result.append(Tool(held if step.load_m > 0 else opening, step.load_m, step.touch_m))
+        else:
+            result.append(Tool(held))
+    return result
 
 
 def outside_box(points: Array, config: CellConfig, slack_m: float, lowest_m: float) -> npt.NDArray[np.bool_]:
@@ -104,7 +215,7 @@ def outside_box(points: Array, config: CellConfig, slack_m: float, lowest_m: flo
     return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))
 
 
-def _check_grip(step: Grip, name: str) -> None:
+def _check_grip(step: Grip | Shape, name: str) -> None:
     if not rg2.MIN_WIDTH_M <= step.width_m <= rg2.MAX_WIDTH_M:
         raise UnsafeMotion(f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's 0 to 110 mm")
     if not rg2.MIN_FORCE_N <= step.force_n <= rg2.MAX_FORCE_N:
@@ -148,8 +259,12 @@ def joint_path(q: Array, step: JointMove, config: CellConfig, name: str) -> Arra
     return path
 
 
-def _linear_path(q: Array, step: LinearMove, config: CellConfig, name: str) -> Array:
-    """Joint angles (N, 6) along a straight motion; raises UnsafeMotion where the arm cannot follow."""
+def linear_path(q: Array, step: LinearMove, config: CellConfig, name: str) -> Array:
+    """Joint angles (N, 6) [rad] along a straight motion of the tcp, for an arm that starts at q (6,).
+
+    Raises:
+        UnsafeMotion: the arm cannot follow, or would be too fast.
+    """
     limits = config.limits
     _check_below(step.speed_m_s, limits.tool_speed_m_s, "tool speed", "m/s", name)
     _check_below(step.acceleration_m_s2, ur5e.MAX_TOOL_ACCELERATION, "tool acceleration", "m/s2", name)
@@ -201,39 +316,64 @@ def check_poses(
     Raises:
         UnsafeMotion: the first violation, with the place and the limit.
     """
+    for where, words in _violations(path, load_m, boxes, config, lowest_tip_m):
+        if where.any():
+            raise UnsafeMotion(f"{name}: {words(int(where.argmax()))}")
+
+
+def allowed_poses(
+    path: Array, load_m: float, boxes: tuple[KeepOut, ...], config: CellConfig, lowest_tip_m: float
+) -> npt.NDArray[np.bool_]:
+    """Which joint angles (N, 6) [rad] `check_poses` finds nothing against; its arguments."""
+    allowed = np.ones(len(path), np.bool_)
+    for where, _ in _violations(path, load_m, boxes, config, lowest_tip_m):
+        allowed &= ~where
+    return allowed
+
+
+def _violations(
+    path: Array, load_m: float, boxes: tuple[KeepOut, ...], config: CellConfig, lowest_tip_m: float
+) -> Iterator[tuple[npt.NDArray[np.bool_], Callable[[int], str]]]:
+    """For each limit which poses (N,) violate it, and the words for one of them."""
     limits, table = config.limits, config.table.height_m
     margin = ur5e.JOINT_LIMIT - limits.joint_margin_rad
-    if (np.abs(path) > margin).any():
+
+    def beyond(_: int) -> str:
         joint = int((np.abs(path) - margin).max(axis=0).argmax())
-        raise UnsafeMotion(
-            f"{name}: joint {joint + 1} would turn to {path[np.abs(path[:, joint]).argmax(), joint]:.2f} rad "
-            f"(limit +-{margin[joint]:.2f} rad)"
-        )
+        angle = path[np.abs(path[:, joint]).argmax(), joint]
+        return f"joint {joint + 1} would turn to {angle:.2f} rad (limit +-{margin[joint]:.2f} rad)"
+
+    yield np.asarray((np.abs(path) > margin).any(axis=1)), beyond
     T_tcp = ur5e.forward(path) @ rg2.T_FLANGE_TCP
     tcp = T_tcp[:, :3, 3]
-    too_low = tcp[:, 2] < table + lowest_tip_m - _ROUNDING_M
-    if too_low.any():
+
+    def too_low(_: int) -> str:
         z = tcp[:, 2].min() - table
-        raise UnsafeMotion(
-            f"{name}: the finger tips would be {1000 * z:.1f} mm above the table (limit {1000 * lowest_tip_m:.1f} mm)"
-        )
-    outside = outside_box(tcp, config, _ROUNDING_M, lowest_tip_m)
-    if outside.any():
-        x, y, z = tcp[int(outside.argmax())]
-        raise UnsafeMotion(
-            f"{name}: the tcp would leave its box at x {x:.3f}, y {y:.3f}, z {z:.3f} m "
+        return f"the finger tips would be {1000 * z:.1f} mm above the table (limit {1000 * lowest_tip_m:.1f} mm)"
+
+    yield np.asarray(tcp[:, 2] < table + lowest_tip_m - _ROUNDING_M), too_low
+
+    def left_box(i: int) -> str:
+        x, y, z = tcp[i]
+        return (
+            f"the tcp would leave its box at x {x:.3f}, y {y:.3f}, z {z:.3f} m "
             f"(limits x {limits.x}, y {limits.y}, z {limits.z} m above the table)"
         )
+
+    yield outside_box(tcp, config, _ROUNDING_M, lowest_tip_m), left_box
     centers = bodies.sphere_centers(path)
     radius = bodies.SPHERES.radius + limits.clearance_m
     above = bodies.SPHERES.group >= _STANDS_ON_TABLE
-    if (centers[:, above, 2] - radius[above] < table).any():
-        raise UnsafeMotion(f"{name}: the arm or the gripper's body would touch the table")
+    yield (
+        np.asarray((centers[:, above, 2] - radius[above] < table).any(axis=1)),
+        lambda _: "the arm or the gripper's body would touch the table",
+    )
     points = bodies.finger_points(T_tcp, load_m)
     for box in boxes:
         body = (bodies.box_distance(*box.corners(), centers) < radius)[:, bodies.SPHERES.group > 0]
         fingers = bodies.box_distance(*box.corners(), points) < limits.clearance_m
-        if body.any() or fingers.any():
-            raise UnsafeMotion(f"{name}: the arm, the gripper or its load would enter the keep-out {box.name!r}")
-    if (bodies.self_distance(centers) < limits.clearance_m).any():
-        raise UnsafeMotion(f"{name}: the arm or the gripper would touch the arm itself")
+        words = f"the arm, the gripper or its load would enter the keep-out {box.name!r}"
+        yield body.any(axis=1) | fingers.any(axis=1), lambda _, words=words: words  # type: ignore[misc]
+    touching = bodies.self_distance(centers) < limits.clearance_m
+    touching |= bodies.hand_distance(centers, T_tcp, load_m) < limits.clearance_m
+    yield touching, lambda _: "the arm, the gripper or its load would touch the arm itself"

@@ -8,9 +8,18 @@ from typing import TYPE_CHECKING
 
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
-from robotcell.motion.plan import Grip, MotionPlan, Step, guarded_move, home_move, joint_move, linear_move
+from robotcell.motion.plan import (
+    MotionPlan,
+    Shape,
+    Step,
+    blend_radius,
+    guarded_move,
+    home_move,
+    joint_move,
+    linear_move,
+)
 from robotcell.motion.rotations import rotation_angle_rad
-from robotcell.motion.tool import near_height, solve_tool_down, tool_down
+from robotcell.motion.tool import near_height, solve_tool_down, tool_down, touch_height
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig, Workspace
@@ -79,8 +88,24 @@ def push_height(top_m: float, config: CellConfig) -> float:
     return max(top_m / 2, config.gripper.tip_clearance_m)
 
 
-def plan_push(push: Push, heightmap: Heightmap, q_start: Array, config: CellConfig) -> MotionPlan:
+def above_push(push: Push, config: CellConfig) -> Array:
+    """T_base_tcp (4, 4) from which the tool comes straight down for a push."""
+    z = config.table.height_m + push_height(push.top_m, config) + config.motion.approach_m
+    return tool_down(*push.start, z, push.theta)
+
+
+def plan_push(
+    push: Push, heightmap: Heightmap, q_start: Array, config: CellConfig, q_above: Array | None = None
+) -> MotionPlan:
     """The motion of a push, from `q_start` (6,) [rad] back to the home pose.
+
+    Args:
+        push: that was decided.
+        heightmap: that it was decided on.
+        q_start: where the arm stands.
+        config: of the cell.
+        q_above: joint angles (6,) [rad] above its start, from which the tool comes straight down and to whose height
+            it is lifted; those nearest to the home pose at the approach height unless given.
 
     Raises:
         UnsafeMotion: a pose is out of reach, or the push is too short to move anything.
@@ -92,20 +117,25 @@ def plan_push(push: Push, heightmap: Heightmap, q_start: Array, config: CellConf
         )
     tcp_z = config.table.height_m + push_height(push.top_m, config)
     approach_z = tcp_z + config.motion.approach_m
-    q_above = solve_tool_down("approach", tool_down(x, y, approach_z, push.theta), config)
+    touch_m = touch_height(push.top_m)
+    top_z = approach_z
+    if q_above is None:
+        q_above = solve_tool_down("approach", above_push(push, config), config, q_start)
+    else:
+        top_z = float((ur5e.forward(q_above) @ rg2.T_FLANGE_TCP)[2, 3])
     T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
     T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
     T_near[2, 3] = near_height(heightmap, x, y, push.theta, rg2.MIN_WIDTH_M, tcp_z, config)
     T_start[2, 3] = tcp_z
     T_end[:3, 3] = (end_x, end_y, tcp_z)
-    T_up[:3, 3] = (end_x, end_y, approach_z)
+    T_up[:3, 3] = (end_x, end_y, top_z)
     steps: tuple[Step, ...] = (
-        Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
-        joint_move("approach", q_above, config),
-        linear_move("descend", T_near, config),
-        guarded_move("descend guarded", T_start, config),
-        guarded_move("push", T_end, config),
-        linear_move("lift", T_up, config),
+        Shape("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
+        joint_move("approach", q_above, config, blend_m=blend_radius(top_z - T_near[2, 3])),
+        linear_move("descend", T_near, config, touch_m=touch_m),
+        guarded_move("descend guarded", T_start, config, touch_m),
+        guarded_move("push", T_end, config, touch_m),
+        linear_move("lift", T_up, config, touch_m=touch_m, blend_m=blend_radius(top_z - tcp_z)),
         home_move(config),
     )
     return MotionPlan("push", q_start, steps)

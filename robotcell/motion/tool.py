@@ -10,13 +10,17 @@ import numpy as np
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform
+from robotcell.perception.clearance_map import TALLEST_BLOCK_M
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from robotcell.perception.heightmap import Heightmap
 
 # What the camera did not see may be as tall as the tallest block.
-TALLEST_OBJECT_M = 0.100
+TALLEST_OBJECT_M = TALLEST_BLOCK_M
+# Where contact is meant, fingers may touch what is up to so much higher than the tallest block, or than what is
+# grasped: the map of clearance rounds up.
+_TOUCH_MARGIN_M = 0.020
 # The gripper is taken to be this much larger all round, for what it comes down beside.
 _AROUND_M = 0.004
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
@@ -34,13 +38,16 @@ def flange_pose(T_base_tcp: Array) -> Array:
     return T_base_tcp @ invert_transform(rg2.T_FLANGE_TCP)
 
 
-def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
-    """Joint angles (6,) [rad] nearest to the home pose; the jaw is symmetric, so half a turn about its axis is as good.
+def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig, q_from: Array | None = None) -> Array:
+    """Joint angles (6,) [rad] in the posture of the home pose.
+
+    The jaw is symmetric, so half a turn about its axis is as good.
 
     Args:
         label: of the step, for the error.
         T_base_tcp: pose (4, 4) of a tool that points down.
         config: of the cell.
+        q_from: joint angles (6,) from which the leading joint is to have the shortest way; the home pose unless given.
 
     Raises:
         UnsafeMotion: the arm cannot reach the pose.
@@ -51,7 +58,24 @@ def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
     if not solutions:
         x, y, z = T_base_tcp[:3, 3]
         raise UnsafeMotion(f"{label}: the arm cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with the tool down")
-    return min(solutions, key=lambda q: float(np.abs(q - home).max()))
+    near = home if q_from is None else q_from
+    return min(solutions, key=lambda q: float(np.abs(q - near).max()))
+
+
+def tool_down_solutions(T_base_tcp: Array, config: CellConfig) -> list[Array]:
+    """All joint angles (6,) [rad] for a pose as in `solve_tool_down`, those nearest to the home pose first.
+
+    They differ in the turns of the wrist, in where the elbow is and to which side the shoulder turns.
+    """
+    home = np.array(config.motion.home_q)
+    poses = (T_base_tcp, T_base_tcp @ np.diag([-1.0, -1.0, 1.0, 1.0]))
+    solutions = np.concatenate([ur5e.inverse_all(flange_pose(T), home) for T in poses])
+    return sorted(solutions, key=lambda q: float(np.abs(q - home).max()))
+
+
+def touch_height(top_m: float) -> float:
+    """Height above the table [m] up to which things may be touched where something with that top is meant."""
+    return max(TALLEST_OBJECT_M, top_m) + _TOUCH_MARGIN_M
 
 
 def near_height(

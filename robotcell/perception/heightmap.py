@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Intrinsics, RgbdFrame
 
-# Returns outside this band above the table [m] are not of things that lie on it: the arm, a lamp, reflections
-# in the table top. The upper end is the height up to which the paper counts a cell as occupied (30 cm); the
-# lower one leaves room for the largest table offset that a configuration may allow (5 cm).
-BAND_M = (-0.10, 0.30)
+# Returns outside this band above the table [m] are not of things that stand on it: a lamp, reflections in the table
+# top. The upper end is as high as the tool may go by default (`limits.z`); the lower one leaves room for the largest
+# table offset that a configuration may allow (5 cm).
+BAND_M = (-0.10, 0.70)
 
 # An unknown cell with this many known neighbours of eight lies in a gap between pixels, not in a shadow, whose
 # straight edge has three.
@@ -139,8 +139,8 @@ def build_heightmap(
 ) -> Heightmap:
     """Project a frame along gravity: each cell takes the height, colour and masks of its highest return.
 
-    Returns lower than 10 cm below the table or higher than 30 cm above it are left out (`BAND_M`); under an
-    arm that reaches into the view the table is therefore unknown, not high.
+    Returns lower than 10 cm below the table or higher than 70 cm above it are left out (`BAND_M`). An arm that reaches
+    into the view counts as something that stands there.
 
     Args:
         frame: colour and registered depth.

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+# In what librealsense says of a file that it cannot read.
+_UNREADABLE = "Request to enable_device_from_file"
+
+
 class CameraSource(Protocol):
     """Cameras that are not on USB. An entry point of the group `robotcell.camera_sources` is a function that opens one.
 
@@ -64,15 +68,24 @@ def open_recording(rs: Any, context: Any, config: Any, path: Path, serial: str |
         serial: of the camera that must have recorded it; None for any.
 
     Raises:
-        ConfigError: there is no such file.
-        ConnectionLost: it is no recording.
+        ConfigError: there is no such file, or it is no whole recording.
+        ConnectionLost: it cannot be played.
         DeviceFault: another camera has recorded it, or in another mode.
     """
     if not path.is_file():
         raise ConfigError(f"camera: {path}: no such file; make one with robotcell twin record", device="camera")
     with sdk_errors(f"opening {path}"):
         config.enable_device_from_file(str(path))
-        device = config.resolve(rs.pipeline_wrapper(rs.pipeline(context))).get_device()
+        try:
+            device = config.resolve(rs.pipeline_wrapper(rs.pipeline(context))).get_device()
+        except RuntimeError as error:
+            if _UNREADABLE not in str(error):
+                raise
+            raise ConfigError(
+                f"camera: {path} is no whole recording ({str(error).rpartition(': ')[2]}): it was cut off or damaged, "
+                "or another generation of librealsense has written it; record it again (docs/how-to/recordings.md)",
+                device="camera",
+            ) from error
     if serial not in (None, serial_number(device)):
         raise DeviceFault(
             f"camera: {path} was recorded by {serial_number(device)}, and the option camera.serial asks for {serial}",

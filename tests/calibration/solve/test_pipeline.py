@@ -37,8 +37,7 @@ def poses_of(seed: int, count: int = 20, mount: str = "fixed") -> Views:
     return as_poses(views, truth, seed=seed, position_m=0.0003, rotation_rad=0.0005)
 
 
-@MOUNTS
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("mount", "seed"), [("fixed", 0), ("fixed", 1), ("flange", 2), ("flange", 3)])
 def test_corners_give_camera_and_board(mount: str, seed: int) -> None:
     views, truth = make_views(seed, mount=mount, **QUIET)
     solution = solve(views)
@@ -83,8 +82,7 @@ def test_outliers_among_the_public_pairs_are_named_and_change_nothing(share: flo
         assert after.spread(unit).median == pytest.approx(before.spread(unit).median, rel=0.1)
 
 
-@MOUNTS
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("mount", "seed"), [("fixed", 0), ("flange", 1)])
 def test_outliers_added_to_corners_change_nothing(mount: str, seed: int) -> None:
     views, _ = make_views(seed, 40, mount=mount, **QUIET)
     before = solve(views)
@@ -104,15 +102,15 @@ def test_outliers_added_to_corners_change_nothing(mount: str, seed: int) -> None
 def test_the_stated_covariance_is_true() -> None:
     """A short form of tests/benchmarks/calibration_coverage.py, with bounds that a true covariance misses never."""
     inside = []
-    for seed in range(40):
+    for seed in range(24):
         views, truth = make_views(seed, 16, **QUIET)
         estimate = solve(views).estimate
         e = difference(estimate.X, truth.X)
         inside.append(e @ np.linalg.solve(estimate.covariance, e))
     inside = np.array(inside)
-    # Binomial, 40 draws: fewer or more than this happens once in a thousand.
-    assert 17 <= (inside < chi2.ppf(0.68, 6)).sum() <= 36
-    assert (inside < chi2.ppf(0.95, 6)).sum() >= 32
+    # Binomial, 24 draws: fewer or more than this happens once in a thousand.
+    assert 8 <= (inside < chi2.ppf(0.68, 6)).sum() <= 23
+    assert (inside < chi2.ppf(0.95, 6)).sum() >= 18
 
 
 def test_a_quieter_set_is_surer() -> None:

@@ -82,9 +82,11 @@ def test_a_drawn_scene_whose_goal_lies_buried_is_drawn_anew():
 
 def test_of_many_failures_the_first_two_and_the_last_are_shown(tmp_path):
     (tmp_path / "one.toml").write_text(toml(("goal", '"red"')))
-    # Nothing is wide enough to count as held.
+    # Whatever is tried is refused: the arm is kept out of where the goal stands.
+    shelf = {"name": "shelf", "x": (-0.65, -0.35), "y": (-0.15, 0.15), "z": (0.0, 0.15)}
     case = Case("one.toml", str(tmp_path / "one.toml"), "red")
-    result, pictures = run_trial(trial(case, gripper__empty_width_m=0.05, gripper__preshape_m=0.055))
+    result, pictures = run_trial(trial(case, keep_out=[shelf]))
+    assert set(result.failures) == {"refused"}
     assert sum(result.failures.values()) > 3
     assert [failure.action.split(".")[0] for failure in result.shown][:2] == ["1", "2"]
     assert int(result.shown[2].action.split(".")[0]) > 3

@@ -1,16 +1,23 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sqlite3
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
+from robotcell.config.schema import JournalPlace
 from robotcell.errors import ConfigError, StorageError
+from robotcell.io.lock_file import LockFile
 from robotcell.jobs.journal import ActionRow, Frame, Journal, OutcomeRow
+from robotcell.jobs.opening import JournalStops
+from robotcell.motion.guard import Stop
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -92,6 +99,44 @@ def test_an_action_is_on_record_before_it_ends(tmp_path: Path) -> None:
     assert metrics.actions == 0
     assert math.isnan(metrics.grasp_success_rate)
     assert math.isnan(metrics.picks_per_hour)
+
+
+def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
+    place = JournalPlace(runs=tmp_path / "runs?mode=ro #2 50%")
+    with Journal(place.database_url()) as journal:
+        journal.start_job(None, "heuristic", {}, tmp_path)
+    assert place.default_file.is_file()
+    with Journal(place.database_url()) as journal:
+        assert len(journal.jobs()) == 1
+
+
+def test_a_journal_whose_file_was_removed_takes_nothing_more(tmp_path: Path) -> None:
+    with Journal(tmp_path / "runs" / "journal.db") as journal:
+        journal.start_job(None, "heuristic", {}, tmp_path)
+        shutil.rmtree(tmp_path / "runs")
+        with pytest.raises(StorageError, match="was removed"):
+            journal.start_job(None, "heuristic", {}, tmp_path)
+
+
+def test_a_stop_stands_for_its_cell_until_it_is_cleared(tmp_path: Path) -> None:
+    place = JournalPlace(runs=tmp_path / "runs")
+    here, elsewhere = (JournalStops(place, cell) for cell in ("arm-192.168.1.10", "arm-192.168.1.11"))
+    assert here.load() is None
+    assert not place.runs.exists(), "asking makes no journal"
+    stop = Stop("the tool feels 120 N", datetime(2026, 5, 4, 3, 2, 1, tzinfo=timezone.utc), np.arange(6.0))
+    with Journal(place.database_url()) as journal:
+        lock = LockFile("arm-192.168.1.10")
+        running = journal.start_job(("red",), "heuristic", {}, tmp_path, lock)
+    here.save(stop)
+    found = JournalStops(place, "arm-192.168.1.10").load()
+    assert found is not None
+    assert (found.what, found.at, found.job) == (stop.what, stop.at, running)
+    np.testing.assert_array_equal(found.q, stop.q)
+    assert elsewhere.load() is None
+    elsewhere.clear()
+    assert here.load() is not None
+    here.clear()
+    assert here.load() is None
 
 
 def test_jobs_are_listed_newest_first(tmp_path: Path) -> None:
@@ -177,6 +222,8 @@ def test_a_journal_of_the_first_schema_is_migrated_with_all_that_it_holds(tmp_pa
             assert (action.outcome.peak_force_n, action.outcome.grip_force_n) == (12.5, None)
             assert action.frame.color_file == "c.png"
             assert journal.metrics(1).pushes == 1
+            assert (journal.job(1).lock, journal.job(1).owner, action.task, action.held) == (None,) * 4
+            assert journal.standing_stop("arm-192.168.1.10") is None
     with Journal(f"sqlite:///{tmp_path}/journal.db") as journal:
         start_action(journal, 1, "grasp")
         assert len(journal.job(1).actions) == 2

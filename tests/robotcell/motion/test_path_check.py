@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotcell.config import CellConfig
@@ -57,6 +57,7 @@ def state(**changes: Any) -> ArmState:
     return replace(measured, **changes)
 
 
+@settings(max_examples=50)
 @given(
     st.sampled_from(KINDS),
     st.floats(CONFIG.workspace.x[0], CONFIG.workspace.x[1]),
@@ -76,9 +77,10 @@ def test_every_action_in_the_workspace_has_a_safe_plan(kind: str, x: float, y: f
 
 @pytest.mark.parametrize("x", [*CONFIG.workspace.x, -0.5])
 @pytest.mark.parametrize("y", [*CONFIG.workspace.y, 0.0])
-@pytest.mark.parametrize("z", [0.0, 0.03, 0.1])
-def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z: float) -> None:
-    for rotation in range(16):
+@pytest.mark.parametrize(("z", "first"), [(0.0, 0), (0.03, 1), (0.1, 2)])
+def test_the_rim_of_the_workspace_is_as_good_as_its_middle(x: float, y: float, z: float, first: int) -> None:
+    # Every third, others at other heights: each place sees all sixteen.
+    for rotation in range(first, 16, 3):
         check_path(plan_action(action("grasp", x, y, z, rotation), heightmap(), HOME, CONFIG), CONFIG)
 
 

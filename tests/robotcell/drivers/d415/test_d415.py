@@ -266,7 +266,7 @@ def test_a_recording_that_is_not_there_or_none(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         camera(source=str(tmp_path / "x.db3")).connect()
     (tmp_path / "y.db3").write_bytes(b"this is no recording" * 100)
-    with pytest.raises(ConnectionLost, match=r"y\.db3"):
+    with pytest.raises(ConfigError, match=r"y\.db3 is no whole recording"):
         camera(source=str(tmp_path / "y.db3")).connect()
 
 

@@ -17,6 +17,7 @@ from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.robotcell.drivers.served_cell import CAMERA_PORT, HOST, MODBUS_PORT
 from tests.robotcell.drivers.ur5e.served_arm import fault, joints, make_arm, wait_until
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from sim_twin.wire.cell import ServedCell
 
-SECONDS = 1.0
+SECONDS = 0.5
 
 
 @pytest.fixture(autouse=True)
@@ -47,7 +48,7 @@ def cell_text(host: str) -> str:
 @pytest.fixture
 def cell_file(tmp_path: Path) -> Path:
     path = tmp_path / "cell.toml"
-    path.write_text(cell_text(HOST))
+    path.write_text(f'{cell_text(HOST)}[journal]\nruns = "{tmp_path / "runs"}"\n')
     return path
 
 
@@ -62,9 +63,9 @@ def wrong(findings: list[Finding]) -> list[Finding]:
 
 def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "absent.toml"
-    path.write_text(cell_text("127.0.0.49"))
+    path.write_text(cell_text(loopback(49)))
     begin = time.monotonic()
-    result = CliRunner().invoke(app, ["doctor", "--cell", str(path), "--json", "--seconds", "5"])
+    result = CliRunner().invoke(app, ["doctor", "--cell", str(path), "--json", "--seconds", "0.5"])
     assert time.monotonic() - begin < 10.0
     assert result.exit_code == 3
     report = json.loads(result.stdout)
@@ -73,12 +74,12 @@ def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> 
     assert set(absent) == {"arm", "gripper", "camera"}
     assert "check that the controller has booted" in absent["arm"]
     assert "check the Compute Box's power" in absent["gripper"]
-    assert "127.0.0.49" in absent["camera"]
+    assert loopback(49) in absent["camera"]
 
 
 def test_a_usb_camera_needs_its_rule_and_is_looked_for(tmp_path: Path) -> None:
     path = tmp_path / "usb.toml"
-    path.write_text(cell_text("127.0.0.49").replace(f"twin://127.0.0.49:{CAMERA_PORT}", "usb"))
+    path.write_text(cell_text(loopback(49)).replace(f"twin://{loopback(49)}:{CAMERA_PORT}", "usb"))
     findings = examine(load_config(path), SECONDS)
     assert any(finding.what == "udev rule" for finding in findings)
     assert any(finding.device == "camera" and "no RealSense" in finding.cure for finding in wrong(findings))
@@ -122,14 +123,20 @@ def test_recover_asks_first_and_then_leaves_the_stop(served: ServedCell, cell_fi
     # Of a protective stop the controller lets nobody go for 5 s; tests/robotcell/drivers/ur5e waits for that.
     with make_arm() as arm:
         served.inject(fault("state", Kind.WRONG, "program_paused"))
-        wait_until(lambda: arm.state().mode is ArmMode.NOT_READY, 1.0)
+        wait_until(lambda: arm.state().mode is ArmMode.NOT_READY)
         runner = CliRunner()
-        refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input="n\n")
-        assert refused.exit_code == 3
-        assert arm.state().mode is ArmMode.NOT_READY
+        for answer in ("n\n", ""):
+            refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input=answer)
+            assert refused.exit_code == 3
+            assert "nothing moved" in refused.stderr
+            assert arm.state().mode is ArmMode.NOT_READY
     left = runner.invoke(app, ["recover", "--cell", str(cell_file), "--yes"])
     assert left.exit_code == 0, left.output
-    assert "ready" in left.output
+    assert "a device is stopped" in left.stderr
+    assert "the arm is ready, and no stop stands" in left.stdout
+    again = runner.invoke(app, ["recover", "--cell", str(cell_file), "--yes"])
+    assert again.exit_code == 0, again.output
+    assert "nothing to recover from" in again.stdout
     with make_arm() as arm:
         assert arm.state().mode is ArmMode.READY
 

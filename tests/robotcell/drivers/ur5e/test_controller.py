@@ -16,11 +16,12 @@ from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
 from robotcell.drivers.ur5e.controller import Controller, arm_mode, inspect, obstacles
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import ArmMode
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-HOST = "127.0.0.41"
+HOST = loopback(41)
 PORTS = (30004, 30003, 29999)
 READY = Controller(
     version=(5, 12, 6, 1),

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sim_twin.wire.d415.clients import Client
 from sim_twin.wire.d415.stream import Request, encode
+from tests.addresses import loopback
 
 LIMIT_S = 10.0
 
@@ -19,7 +20,7 @@ REQUEST = Request(resolution="640x480")
 
 @contextlib.contextmanager
 def connected():
-    with socket.create_server(("127.0.0.35", 0)) as listener, socket.create_connection(listener.getsockname()) as far:
+    with socket.create_server((loopback(35), 0)) as listener, socket.create_connection(listener.getsockname()) as far:
         near, _ = listener.accept()
         near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         yield near, far

@@ -55,6 +55,14 @@ def test_a_recording_of_another_camera_or_mode_is_refused(recording):
         player(recording, "1280x720").connect()
 
 
+def test_a_recording_that_was_cut_off_is_called_so(recording, tmp_path):
+    cut = tmp_path / "cut.db3"
+    cut.write_bytes(recording.read_bytes()[: recording.stat().st_size * 9 // 10])
+    with pytest.raises(ConfigError, match=r"no whole recording.*cut off.*record it again") as caught:
+        player(cut).connect()
+    assert "USB" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("name", "words"), [("there.db3", "exists already"), ("scene.bag", r"\*\.db3"), ("nowhere/x.db3", "no such folder")]
 )

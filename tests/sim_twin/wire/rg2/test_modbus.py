@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_twin.wire.rg2.modbus import ModbusServer, Refusal, RefusedError, answer, split_frames
+from tests.addresses import loopback
 
 PDUS = st.binary(min_size=1, max_size=253)
 # Mostly function codes that exist, with plausible numbers.
@@ -114,7 +115,7 @@ def test_an_unknown_unit_meets_silence():
 # The server
 
 
-HOST = "127.0.0.36"
+HOST = loopback(36)
 READ = frame(struct.pack(">BHH", 3, 8, 2))
 RESPONSE = frame(struct.pack(">BBHH", 3, 4, 8, 9))
 
