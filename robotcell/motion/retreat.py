@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.errors import UnsafeMotion
-from robotcell.geometry import rg2
+from robotcell.geometry import rg2, ur5e
 from robotcell.motion.clearance import Obstructed
 from robotcell.motion.grasp import GRASP_DEPTH_M, LOAD_REACH_M, carry_height
 from robotcell.motion.path_check import check_path
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from robotcell.config import CellConfig
+    from robotcell.geometry.transforms import Array
     from robotcell.interfaces import ArmState
     from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.clearance_map import ClearanceMap
@@ -102,7 +103,20 @@ def check_recovery(state: ArmState, config: CellConfig) -> CheckedPlan:
     Raises:
         UnsafeMotion: the way is not safe.
     """
-    return _from_as_high_as_possible(lambda up_m: plan_recovery(state, config, up_m), config)
+    checked = _from_as_high_as_possible(lambda up_m: plan_recovery(state, config, up_m), config)
+    plan = checked.plan
+    steps = tuple(_joints_slow(step, path) for step, path in zip(plan.steps, checked.joint_paths, strict=True))
+    return check_path(MotionPlan(plan.label, plan.q_start, steps), config)
+
+
+def _joints_slow(step: Step, path: Array) -> Step:
+    """A step along whose joint path (N, 6) no joint turns fast, as the elbow of an arm that stretches does."""
+    if not isinstance(step, LinearMove) or len(path) < 2:
+        return step
+    start = (ur5e.forward(path[0]) @ rg2.T_FLANGE_TCP)[:3, 3]
+    piece_m = float(np.linalg.norm(step.T_base_tcp[:3, 3] - start)) / (len(path) - 1)
+    turn_rad = float(np.abs(np.diff(path, axis=0)).max())
+    return replace(step, speed_m_s=min(step.speed_m_s, SLOW_RAD_S * piece_m / turn_rad)) if turn_rad > 0 else step
 
 
 def plan_recovery(state: ArmState, config: CellConfig, up_m: float = 0.0) -> MotionPlan:
