@@ -14,6 +14,7 @@ from calibration.collect.board_motion import plan_motions
 from calibration.collect.capture import Capture, capture_view
 from calibration.collect.running_estimate import RunningEstimate, running_estimate
 from calibration.collect.session import REFUSED, add_capture, read_session
+from calibration.collect.surroundings import what_stands
 from calibration.collect.view_planning import plan_views
 from calibration.solve.se3 import difference
 from calibration.target.detection import Detector
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from robotcell.cell import Cell
     from robotcell.config.calibration_file import CharucoBoard
     from robotcell.geometry.transforms import Array
+    from robotcell.perception.clearance_map import ClearanceMap
 
 # The remaining views are planned again, once, when the camera is found so far from where cell.toml has it.
 _PLAN_AGAIN_VIEWS = 8
@@ -70,7 +72,8 @@ def collect(cell: Cell, folder: Path, held: HeldBoard, count: int, seed: int, pr
     detector = Detector(held.board)
     q_first = cell.arm.state().q
     T_base_camera = cell.config.camera.pose()
-    intrinsics = cell.camera.read().intrinsics
+    # What stands there stays there: the arm comes back to where it stood for this frame.
+    frame = cell.camera.read()
     for _ in range(_ROUNDS):
         views = read_session(folder)
         taken = len(views)
@@ -80,11 +83,22 @@ def collect(cell: Cell, folder: Path, held: HeldBoard, count: int, seed: int, pr
         if estimate is not None and taken >= _PLAN_AGAIN_VIEWS:
             T_base_camera, held = estimate.T_base_camera, HeldBoard(held.board, estimate.T_flange_board)
         seen = list(np.linalg.inv(T_base_camera) @ views.T_base_flange @ held.T_flange_board)
-        plan = plan_views(cell.config, held, T_base_camera, intrinsics, count - taken, seed, cell.arm.state().q, seen)
+        standing = what_stands(frame, q_first, held, T_base_camera, cell.config)
+        plan = plan_views(
+            cell.config,
+            held,
+            T_base_camera,
+            frame.intrinsics,
+            count - taken,
+            seed,
+            cell.arm.state().q,
+            seen,
+            standing,
+        )
         for q in plan.views:
             progress.moving(taken, count)
             try:
-                motions = plan_motions("go to a view", cell.arm.state().q, q, plan.q_via, held, cell.config)
+                motions = plan_motions("go to a view", cell.arm.state().q, q, plan.q_via, held, cell.config, standing)
             except UnsafeMotion as error:
                 progress.skipped(str(error))
                 continue
@@ -94,7 +108,7 @@ def collect(cell: Cell, folder: Path, held: HeldBoard, count: int, seed: int, pr
             if taken == _PLAN_AGAIN_VIEWS and estimate is not None and _is_elsewhere(estimate, T_base_camera):
                 break
         else:
-            _go_back(cell, q_first, plan.q_via, held, progress)
+            _go_back(cell, q_first, plan.q_via, held, standing, progress)
     if len(read_session(folder)) < count:
         raise CalibrationError(
             f"{len(read_session(folder))} of {count} views show the board: it is not seen where it should be. Look at "
@@ -130,9 +144,11 @@ def _is_elsewhere(estimate: RunningEstimate, T_base_camera: Array) -> bool:
     return bool(np.linalg.norm(off[:3]) > _PLAN_AGAIN_M or np.linalg.norm(off[3:]) > _PLAN_AGAIN_RAD)
 
 
-def _go_back(cell: Cell, q_first: Array, q_via: Array, held: HeldBoard, progress: CollectionProgress) -> None:
+def _go_back(
+    cell: Cell, q_first: Array, q_via: Array, held: HeldBoard, standing: ClearanceMap, progress: CollectionProgress
+) -> None:
     try:
-        motions = plan_motions("go back", cell.arm.state().q, q_first, q_via, held, cell.config)
+        motions = plan_motions("go back", cell.arm.state().q, q_first, q_via, held, cell.config, standing)
     except UnsafeMotion as error:
         progress.skipped(str(error))
         return

@@ -1,6 +1,7 @@
 """Motions of the arm with the board: checked as every motion is, and for the plate as well.
 
-The plate keeps clear of the arm, of the keep-outs, and of all that may stand on the table.
+The plate keeps clear of the arm, of the keep-outs, and of all that may stand on the table; of what is taller than that,
+arm and plate keep clear by what the camera saw.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
     from robotcell.motion.path_check import CheckedPlan
+    from robotcell.perception.clearance_map import ClearanceMap
 
 # Room around the plate for how differently it may be held.
 _CLEARANCE_M = 0.015
@@ -33,35 +35,51 @@ _WRISTS, FLANGE = 4, 6
 
 
 def plan_motions(
-    label: str, q_start: Array, q: Array, q_via: Array, held: HeldBoard, config: CellConfig
+    label: str,
+    q_start: Array,
+    q: Array,
+    q_via: Array,
+    held: HeldBoard,
+    config: CellConfig,
+    seen: ClearanceMap | None = None,
 ) -> list[CheckedPlan]:
-    """The motions to joint angles (6,): straight there, or else through the via pose.
+    """The motions to joint angles (6,): straight there, or else through the via pose; see `plan_motion`.
 
     Raises:
         UnsafeMotion: neither is safe.
     """
     try:
-        return [plan_motion(label, q_start, q, held, config)]
+        return [plan_motion(label, q_start, q, held, config, seen)]
     except UnsafeMotion:
-        to_via = plan_motion(f"{label}, by way of the middle", q_start, q_via, held, config)
-        return [to_via, plan_motion(label, q_via, q, held, config)]
+        to_via = plan_motion(f"{label}, by way of the middle", q_start, q_via, held, config, seen)
+        return [to_via, plan_motion(label, q_via, q, held, config, seen)]
 
 
-def plan_motion(label: str, q_start: Array, q: Array, held: HeldBoard, config: CellConfig) -> CheckedPlan:
+def plan_motion(
+    label: str, q_start: Array, q: Array, held: HeldBoard, config: CellConfig, seen: ClearanceMap | None = None
+) -> CheckedPlan:
     """A joint-space motion with the board in the gripper, checked for arm, gripper and board.
+
+    Args:
+        label: of the motion, for errors.
+        q_start: where it starts (6,) [rad].
+        q: where it ends (6,) [rad].
+        held: the board.
+        config: of the cell.
+        seen: what may stand on the table; None if nobody looked.
 
     Raises:
         UnsafeMotion: the first thing that stands in the way.
     """
     speed = min(_JOINT_SPEED_RAD_S, config.motion.joint_speed_rad_s)
     move = JointMove(label, q, speed, config.motion.joint_acceleration_rad_s2)
-    checked = check_path(MotionPlan(label, q_start, (move,)), config)
+    checked = check_path(MotionPlan(label, q_start, (move,)), config, seen)
     # Where the arm stands now is a fact: only where it goes is checked.
-    _check_board(checked.joint_paths[0][1:], held, config, label)
+    _check_board(checked.joint_paths[0][1:], held, config, label, seen)
     return checked
 
 
-def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str) -> None:
+def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str, seen: ClearanceMap | None) -> None:
     """Keep the plate clear of table, obstacles and arm along joint angles (N, 6)."""
     T_base_flange = ur5e.forward(path)
     points = np.einsum("nij,kj->nki", T_base_flange[:, :3, :3], held.points) + T_base_flange[:, None, :3, 3]
@@ -70,6 +88,10 @@ def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str) -
     lowest = min(points[..., 2].min(), (centers[:, wrists, 2] - bodies.SPHERES.radius[wrists]).min())
     if lowest < config.table.height_m + _ABOVE_TABLE_M:
         raise UnsafeMotion(f"{label}: the board or the wrist would touch what may stand on the table")
+    if seen is not None:
+        corners = points.reshape(-1, 3)
+        if seen.gaps(corners, np.zeros(len(corners)), 0.0, _CLEARANCE_M).min() < _CLEARANCE_M:
+            raise UnsafeMotion(f"{label}: the board would touch what the camera saw on the table")
     for box in obstacles(config):
         if bodies.box_distance(*box.corners(), points).min() < _CLEARANCE_M:
             raise UnsafeMotion(f"{label}: the board would enter the keep-out {box.name!r}")

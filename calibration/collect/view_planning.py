@@ -2,7 +2,8 @@
 
 Poses are drawn in the camera's frame, where it is easy to say what a good view is, and kept where the arm can hold
 them. Of those that are left, the ones that differ most from each other are taken, and put in an order of short ways.
-The camera's pose is only a guess at this point: it decides what is visible, never what is safe.
+The camera's pose is only a guess at this point: it decides what is visible. Of what is safe it only says where things
+stand, with room for how wrong it may be.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from calibration.target.held_board import HeldBoard
     from robotcell.config import CellConfig
     from robotcell.interfaces import Intrinsics
+    from robotcell.perception.clearance_map import ClearanceMap
 
 # Beyond this, corners of a printed board get uncertain and its depth is lost to reflections.
 MAX_TILT_RAD = np.radians(45)
@@ -68,6 +70,7 @@ def plan_views(
     seed: int,
     q_start: Array,
     taken: Sequence[Array] = (),
+    seen: ClearanceMap | None = None,
 ) -> ViewPlan:
     """Up to `count` views; the same arguments give the same plan.
 
@@ -80,20 +83,21 @@ def plan_views(
         seed: of the draw.
         q_start: where the arm stands (6,) [rad].
         taken: T_camera_board of the views that exist already; the new ones differ from them.
+        seen: what may stand on the table; None if nobody looked.
 
     Raises:
         UnsafeMotion: there is no pose to begin with; the message says what stood in the way.
     """
     rng = np.random.default_rng([seed, len(taken)])
     refused: Counter[str] = Counter()
-    q_via = _find_via_pose(config, held, T_base_camera, intrinsics, rng, q_start, refused)
+    q_via = _find_via_pose(config, held, T_base_camera, intrinsics, rng, q_start, refused, seen)
     if q_via is None:
         reasons = ", ".join(f"{reason} ({times} times)" for reason, times in refused.most_common(3))
         raise UnsafeMotion(
             f"no pose of the arm shows the board to the camera: {reasons}. Check the camera's place in cell.toml, the "
             "workspace and the keep-outs, how the board is held, and that the arm can leave the pose that it is in"
         )
-    poses, joints = _candidates(config, held, T_base_camera, intrinsics, count * _CANDIDATES, rng, q_via)
+    poses, joints = _candidates(config, held, T_base_camera, intrinsics, count * _CANDIDATES, rng, q_via, seen)
     chosen = _most_different(poses, list(taken), count)
     return ViewPlan(q_via, tuple(_in_order([joints[i] for i in chosen], q_start)))
 
@@ -123,6 +127,7 @@ def _find_via_pose(
     rng: np.random.Generator,
     q_start: Array,
     refused: Counter[str],
+    seen: ClearanceMap | None,
 ) -> Array | None:
     """Joint angles of a pose in the middle of the view that the arm can go to, the nearest of several; or None."""
     found: list[Array] = []
@@ -136,7 +141,7 @@ def _find_via_pose(
             refused["the arm hides the board"] += 1
             continue
         try:
-            plan_motion("first view", q_start, q, held, config)
+            plan_motion("first view", q_start, q, held, config, seen)
         except UnsafeMotion as error:
             refused[str(error).partition(": ")[2]] += 1
             continue
@@ -154,6 +159,7 @@ def _candidates(
     count: int,
     rng: np.random.Generator,
     q_via: Array,
+    seen: ClearanceMap | None,
 ) -> tuple[list[Array], list[Array]]:
     """T_camera_board and joint angles of poses that are visible and that the arm can go to from the via pose."""
     T_board_flange = invert_transform(held.T_flange_board)
@@ -170,8 +176,8 @@ def _candidates(
             continue
         try:
             # Where the arm cannot stand it cannot go either, and that is sooner found out.
-            plan_motion("stand", q, q, held, config)
-            plan_motion("way", q_via, q, held, config)
+            plan_motion("stand", q, q, held, config, seen)
+            plan_motion("way", q_via, q, held, config, seen)
         except UnsafeMotion:
             continue
         poses.append(T_camera_board)

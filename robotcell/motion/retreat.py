@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import closed_width
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.motion.clearance import Obstructed
@@ -87,16 +88,6 @@ def _lowest_rise(config: CellConfig) -> float:
     return config.motion.approach_m + GRASP_DEPTH_M
 
 
-def _from_as_high_as_possible(plan_of: Callable[[float], MotionPlan], config: CellConfig) -> CheckedPlan:
-    """The plan that goes up highest, of those that are safe; `plan_of` makes it of a height above the table [m]."""
-    for up_m in np.arange(config.limits.z[1], _lowest_rise(config), -_RISE_STEP_M):
-        try:
-            return check_path(plan_of(float(up_m)), config)
-        except UnsafeMotion:
-            continue
-    return check_path(plan_of(0.0), config)
-
-
 def check_recovery(state: ArmState, config: CellConfig) -> CheckedPlan:
     """The way home after a stop, from wherever the arm stands; nobody looked, so it goes up as high as it can first.
 
@@ -107,6 +98,16 @@ def check_recovery(state: ArmState, config: CellConfig) -> CheckedPlan:
     plan = checked.plan
     steps = tuple(_joints_slow(step, path) for step, path in zip(plan.steps, checked.joint_paths, strict=True))
     return check_path(MotionPlan(plan.label, plan.q_start, steps), config)
+
+
+def _from_as_high_as_possible(plan_of: Callable[[float], MotionPlan], config: CellConfig) -> CheckedPlan:
+    """The plan that goes up highest, of those that are safe; `plan_of` makes it of a height above the table [m]."""
+    for up_m in np.arange(config.limits.z[1], _lowest_rise(config), -_RISE_STEP_M):
+        try:
+            return check_path(plan_of(float(up_m)), config)
+        except UnsafeMotion:
+            continue
+    return check_path(plan_of(0.0), config)
 
 
 def _joints_slow(step: Step, path: Array) -> Step:
@@ -136,7 +137,7 @@ def plan_recovery(state: ArmState, config: CellConfig, up_m: float = 0.0) -> Mot
 
 def plan_feel(state: ArmState, config: CellConfig) -> MotionPlan:
     """Straight up, and close the fingers there: what they then are apart is what they hold."""
-    feel = Grip("feel what is held", rg2.MIN_WIDTH_M, config.gripper.force_n)
+    feel = Grip("feel what is held", closed_width(config), config.gripper.force_n)
     return MotionPlan("feel what is held", state.q, (*_rise(state, config), feel))
 
 

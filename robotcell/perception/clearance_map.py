@@ -7,9 +7,9 @@ hidden in a shadow and what gives no return at all thus all have a height, which
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
@@ -108,6 +108,15 @@ class ClearanceMap:
             gaps[near] = np.minimum(far_m, np.sqrt((across * across + up * up).min(axis=1)) - radius[near])
         return gaps
 
+    def widened(self, by_m: float) -> ClearanceMap:
+        """The map with all that may stand there so much wider to all sides and higher [m]."""
+        size = 2 * int(np.ceil(by_m / RESOLUTION_M)) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        ceiling = np.asarray(cv2.dilate(self.ceiling_m, disc), np.float32)
+        ceiling[ceiling > 0] += np.float32(by_m)
+        open_top = cv2.dilate(self.open_top.astype(np.uint8), disc) > 0
+        return replace(self, ceiling_m=ceiling, open_top=open_top)
+
     @cached_property
     def top_m(self) -> float:
         """Height above the table [m] above which nothing stands."""
@@ -179,69 +188,59 @@ class ClearanceMap:
 
 
 def build_clearance_map(
-    frame: RgbdFrame, camera: CalibratedCamera, table_height_m: float, furniture: Sequence[KeepOut]
+    frame: RgbdFrame,
+    camera: CalibratedCamera,
+    table_height_m: float,
+    furniture: Sequence[KeepOut],
+    own: npt.NDArray[np.bool_] | None = None,
 ) -> ClearanceMap:
     """What may stand on the table, by a frame.
 
     Args:
-        frame: with registered depth; the arm stands out of its view.
+        frame: with registered depth.
         camera: that took it, as its calibration has it.
         table_height_m: z of the table in the base frame.
         furniture: boxes that stand on the table and are known: there columns are followed up from their tops.
+        own: (Himg, Wimg) pixels that may show the arm or what it holds: what they hide was not looked at. None where
+            the arm is in no picture.
 
     Raises:
         CalibrationError: the frame is of another resolution than the calibration.
     """
-    depth = camera.depth_m(frame)
-    first_col, last_col = _valid_columns(depth)
-    footprint = np.ones((_FOOTPRINT_PX, _FOOTPRINT_PX), np.uint8)
-    # A zero depth is no return: it hides what is behind it only where nothing around it returned either.
-    nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), footprint)
-
+    sight = _sight(frame, camera, own)
     origin, shape = _extent(frame, camera, table_height_m)
     rows, cols = shape
     x = origin[0] + (np.arange(cols) + 0.5) * RESOLUTION_M
     y = origin[1] + (np.arange(rows) + 0.5) * RESOLUTION_M
-    X, Y = (grid.ravel() for grid in np.meshgrid(x, y))
-    foot = np.full(rows * cols, _LOWEST_M)
+    places = np.stack([grid.ravel() for grid in np.meshgrid(x, y)], axis=-1)
+    height = np.full(len(places), _LOWEST_M)
     for box in furniture:
-        standing = np.abs(X - sum(box.x) / 2) < (box.x[1] - box.x[0]) / 2 + _FURNITURE_M
-        standing &= np.abs(Y - sum(box.y) / 2) < (box.y[1] - box.y[0]) / 2 + _FURNITURE_M
-        foot[standing] = np.maximum(foot[standing], box.z[1] - table_height_m + _LOWEST_M)
+        (x0, x1), (y0, y1) = box.x, box.y
+        middle, half = ((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2 + _FURNITURE_M, (y1 - y0) / 2 + _FURNITURE_M)
+        standing = (np.abs(places - middle) < half).all(axis=1)
+        height[standing] = np.maximum(height[standing], box.z[1] - table_height_m + _LOWEST_M)
 
-    def look(cells: npt.NDArray[np.intp], height: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Depth of the points over cells, nearest return around their pixels, and whether they are in the picture."""
-        u, v, at = camera.project(np.column_stack([X[cells], Y[cells], table_height_m + height]), frame.intrinsics).T
-        with np.errstate(invalid="ignore"):
-            column, line = np.rint(u), np.rint(v)
-            within = (at > 0) & (column >= first_col) & (column < last_col) & (line >= 0) & (line < depth.shape[0])
-        seen = np.full(len(cells), np.inf)
-        seen[within] = nearest[line[within].astype(np.intp), column[within].astype(np.intp)]
-        return at, seen, within
+    def look(cells: npt.NDArray[np.intp]) -> _Looks:
+        return sight.look(np.column_stack([places[cells], table_height_m + height[cells]]))
 
-    ceiling = np.zeros(rows * cols, np.float32)
-    open_top = np.zeros(rows * cols, np.bool_)
-    left_hidden = np.zeros(rows * cols, np.bool_)
-    everywhere = np.arange(rows * cols)
-    depth_at, seen, within = look(everywhere, foot)
-    looked_at = within.copy()
-    ceiling[~looked_at & (np.hypot(X, Y) > _BASE_M)] = TALLEST_BLOCK_M
-    camera_m = float(camera.position[2]) - table_height_m
-    height = foot.copy()
+    ceiling = np.zeros(len(places), np.float32)
+    open_top, left_hidden = np.zeros(len(places), np.bool_), np.zeros(len(places), np.bool_)
+    first = look(np.arange(len(places)))
+    looked_at = first.within & ~first.veiled
+    ceiling[~looked_at & (np.hypot(*places.T) > _BASE_M)] = TALLEST_BLOCK_M
     # Whether a column was last followed through a surface, rather than through the shadow of something.
-    surface = np.abs(seen - depth_at) < _BEFORE_M
-    passed = np.isfinite(seen) & (seen > depth_at + _PAST_M)
-    open_cells = everywhere[within & ~passed]
-    while open_cells.size:
-        height[open_cells] += _STEP_M
-        open_cells_high = height[open_cells] >= camera_m
-        depth_at, seen, within = look(open_cells, height[open_cells])
-        out = ~within | open_cells_high
-        open_top[open_cells[out & surface[open_cells]]] = True
-        left_hidden[open_cells[out]] = True
-        ceiling[open_cells] = height[open_cells]
-        surface[open_cells[~out]] = np.abs(seen - depth_at)[~out] < _BEFORE_M
-        open_cells = open_cells[~out & ~(np.isfinite(seen) & (seen > depth_at + _PAST_M))]
+    surface = first.surface.copy()
+    camera_m = float(camera.position[2]) - table_height_m
+    hidden = np.flatnonzero(looked_at & ~first.passed)
+    while hidden.size:
+        height[hidden] += _STEP_M
+        looks = look(hidden)
+        out = ~looks.within | looks.veiled | (height[hidden] >= camera_m)
+        open_top[hidden[out & surface[hidden]]] = True
+        left_hidden[hidden[out]] = True
+        ceiling[hidden] = np.where(looks.veiled, np.maximum(height[hidden], TALLEST_BLOCK_M), height[hidden])
+        surface[hidden[~out]] = looks.surface[~out]
+        hidden = hidden[~out & ~looks.passed]
     top = open_top.reshape(shape)
     if top.any():
         reach = 2 * round(_DEEPEST_M / RESOLUTION_M) + 1
@@ -249,6 +248,64 @@ def build_clearance_map(
         top = deep & left_hidden.reshape(shape)
         ceiling[top.ravel()] = camera_m
     return ClearanceMap(origin, ceiling.reshape(shape), looked_at.reshape(shape), top, table_height_m)
+
+
+class _Looks(NamedTuple):
+    """What the camera sees at points, all (N,): are they in its picture, does it see past them, or a surface there?
+
+    `veiled` are those in its picture that the arm may hide.
+    """
+
+    within: npt.NDArray[np.bool_]
+    passed: npt.NDArray[np.bool_]
+    surface: npt.NDArray[np.bool_]
+    veiled: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """A frame as it is asked about points of the base frame.
+
+    Attributes:
+        nearest_m: (H, W) the nearest return around each pixel [m]; infinite where there is none.
+        valid: (H, W) pixels through which the camera looks.
+        own: (H, W) those that may show the arm or what it holds.
+        frame, camera: that took it.
+    """
+
+    nearest_m: npt.NDArray[np.float32]
+    valid: npt.NDArray[np.bool_]
+    own: npt.NDArray[np.bool_]
+    frame: RgbdFrame
+    camera: CalibratedCamera
+
+    def look(self, points: Array) -> _Looks:
+        """What the camera sees at points (N, 3) of the base frame."""
+        u, v, depth = self.camera.project(points, self.frame.intrinsics).T
+        rows, cols = self.valid.shape
+        with np.errstate(invalid="ignore"):
+            col, row = np.rint(u), np.rint(v)
+            within = (depth > 0) & (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
+        pixel = row[within].astype(np.intp), col[within].astype(np.intp)
+        seen = np.full(len(points), np.inf)
+        seen[within] = self.nearest_m[pixel]
+        passed = np.isfinite(seen) & (seen > depth + _PAST_M)
+        veiled = np.zeros(len(points), np.bool_)
+        veiled[within] = self.own[pixel]
+        within[within] = self.valid[pixel]
+        return _Looks(within, passed, np.abs(seen - depth) < _BEFORE_M, within & veiled & ~passed)
+
+
+def _sight(frame: RgbdFrame, camera: CalibratedCamera, own: npt.NDArray[np.bool_] | None) -> _Sight:
+    depth = camera.depth_m(frame)
+    # No return hides what is behind it only where nothing around it returned either.
+    returns = np.where(depth > 0, depth, np.float32(np.inf))
+    nearest = cv2.erode(returns, np.ones((_FOOTPRINT_PX, _FOOTPRINT_PX), np.uint8))
+    valid = np.zeros(depth.shape, np.bool_)
+    first, last = _valid_columns(depth)
+    valid[:, first:last] = True
+    own = np.zeros(depth.shape, np.bool_) if own is None else own
+    return _Sight(np.asarray(nearest, np.float32), valid, own, frame, camera)
 
 
 def _valid_columns(depth: npt.NDArray[np.float32]) -> tuple[int, int]:

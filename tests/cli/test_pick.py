@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import logging
 import signal
@@ -14,6 +15,10 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from cli.main import app
+from cli.options import CellChoice
+from cli.pick import run_pick
+from robotcell.config import load_config
+from robotcell.jobs.journal import Journal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -168,6 +173,9 @@ def test_jobs_are_listed_and_shown(cell: Path) -> None:
         (("--goal", "red", "--set", "limits"), 2, "say KEY=VALUE"),
         (("--goal", "red", "--policy", "oracle"), 2, "no policy is called 'oracle'"),
         (("--goal", "red", "--scene", "moon"), 2, "moon"),
+        (("--goal", "red", "--speed", "0.01"), 2, "--speed 0.01: Input should be greater than or equal to 0.05"),
+        (("--goal", "red", "--confirm"), 2, "there is no terminal to ask at"),
+        (("--goal", "red", "--confirm", "--dry-run"), 2, "a dry run moves nothing"),
         (("--goal", "green"), 1, "no green object"),
     ],
 )
@@ -175,6 +183,22 @@ def test_a_refusal_says_why(cell: Path, arguments: tuple[str, ...], code: int, m
     result = run("pick", "--cell", cell, *arguments)
     assert result.exit_code == code, result.output
     assert message in result.stderr
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_each_action_is_shown_and_asked_for_at_the_terminal(cell: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("n\ny\n"))
+    choice = CellChoice(cell, None, {"--policy": "heuristic", "--speed": 0.5})
+    assert run_pick("red", False, choice, confirm=True, dry_run=False, as_json=True) == 0
+    with Journal(load_config(cell).journal.database_url()) as journal:
+        job = journal.job(1)
+    assert [row.outcome.result for row in job.actions if row.outcome] == ["declined", "picked"]
+    assert job.config["motion"]["speed_fraction"] == 0.5
+    assert len(list(Path(job.run_dir).glob("confirm-*.png"))) == 2
 
 
 def test_what_was_done_before_a_refusal_is_in_the_json(cell: Path) -> None:

@@ -16,7 +16,7 @@ from cli.main import app
 from tests.addresses import loopback
 from tests.processes import all_end
 
-LIMIT_S = 60.0
+LIMIT_S = 120.0
 COMMAND = [sys.executable, "-c", "from cli.main import main; main()", "twin"]
 PORTS = ["--modbus-port", "0", "--camera-port", "0", "--control-port", "0"]
 

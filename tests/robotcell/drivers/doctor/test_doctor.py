@@ -11,10 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
+from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import examine
-from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
+from robotcell.findings import Finding, Grade
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
 from tests.addresses import loopback
@@ -75,6 +76,18 @@ def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> 
     assert "check that the controller has booted" in absent["arm"]
     assert "check the Compute Box's power" in absent["gripper"]
     assert loopback(49) in absent["camera"]
+
+
+def test_finger_tips_that_cannot_reach_the_preshape_are_refused(served: ServedCell, tmp_path: Path) -> None:
+    path = tmp_path / "tips.toml"
+    path.write_text(cell_text(HOST).replace("port =", "fingertip_offset_m = 0.02\nport ="))
+    for command in (["doctor", "--seconds", "0.5"], ["pick", "--all", "--dry-run"], ["pick", "--all"]):
+        result = CliRunner().invoke(app, [*command, "--cell", str(path), "--json"])
+        assert result.exit_code == (3 if command[0] == "doctor" else 2)
+        assert "gripper.preshape_m = 0.08: outside" in result.stdout
+    # From Python, the cell does not open.
+    with pytest.raises(ConfigError, match="to 70 mm"), open_cell(load_config(path)):
+        pytest.fail("it opened")
 
 
 def test_a_usb_camera_needs_its_rule_and_is_looked_for(tmp_path: Path) -> None:
