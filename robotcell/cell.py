@@ -18,7 +18,7 @@ from robotcell.motion.guard import Latch
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
 from robotcell.motion.recorder import Recorder
-from robotcell.motion.retreat import check_retreat, plan_recovery
+from robotcell.motion.retreat import check_recovery, check_retreat
 from robotcell.perception.view import View, look
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ class Cell:
             UnsafeMotion: that way is not safe.
             ConnectionLost: the arm is not connected.
         """
-        return check_path(plan_recovery(self.arm.state(), self.config), self.config)
+        return check_recovery(self.arm.state(), self.config)
 
     def leave_stops(self) -> None:
         """Leave a stop of gripper and arm; nothing moves. Only because an operator asked for it. The arm is connected.

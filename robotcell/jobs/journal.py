@@ -190,9 +190,10 @@ class Journal:
                 stop.cleared = _now()
 
     def newest_job(self, lock: str) -> Job | None:
-        """The last job of a cell, by the name of its lock, without its actions."""
+        """The last job of a cell, by the name of its lock, without its actions; one that was refused moved nothing."""
         with self._reading() as session:
-            return session.scalar(select(Job).where(Job.lock == lock).order_by(Job.id.desc()).limit(1))
+            begun = select(Job).where(Job.lock == lock, Job.status != "refused")
+            return session.scalar(begun.order_by(Job.id.desc()).limit(1))
 
     def jobs(self, limit: int = 20) -> list[Job]:
         """The newest jobs first, without their actions."""

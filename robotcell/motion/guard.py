@@ -28,8 +28,8 @@ _START_TOLERANCE_RAD = 0.02
 _SPEED_SLACK = 1.05
 _BOX_SLACK_M = 0.005
 # From a measurement to a brake that acts: the age of a state, a period of the executor, the way of the command. Then
-# the tool brakes at 10 m/s^2 (what the driver passes to stopl), here 0.5 m from the joint that turns fastest. With both
-# the served arm stands within 52 ms of a stop at 0.1 m/s (docs/explanation/what-was-verified.md).
+# the tool brakes at 10 m/s^2 (what the driver passes to stopl), here 0.5 m from the joint that turns fastest. With
+# both, the served arm stands within 52 ms of a stop at 0.1 m/s (docs/explanation/what-was-verified.md).
 _REACTION_S = 0.03
 _BRAKES_RAD_S2 = 20.0
 # Where nothing is to be touched, a force over this share of its limit for so long is no noise but something that gives

@@ -9,6 +9,7 @@ import numpy as np
 
 from robotcell.config.fingers import closed_width
 from robotcell.errors import UnsafeMotion
+from robotcell.geometry import rg2, ur5e
 from robotcell.motion.clearance import Obstructed
 from robotcell.motion.grasp import GRASP_DEPTH_M, LOAD_REACH_M, carry_height
 from robotcell.motion.path_check import check_path
@@ -17,7 +18,10 @@ from robotcell.motion.tool import touch_height
 from robotcell.motion.way import led_around
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.config import CellConfig
+    from robotcell.geometry.transforms import Array
     from robotcell.interfaces import ArmState
     from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.clearance_map import ClearanceMap
@@ -57,12 +61,7 @@ def check_retreat(state: ArmState, config: CellConfig, seen: ClearanceMap | None
             return check_path(plan, config, seen)
         except Obstructed:
             return check_path(led_around(plan, seen, config), config, seen)
-    for up_m in np.arange(config.limits.z[1], _lowest_rise(config), -_RISE_STEP_M):
-        try:
-            return check_path(plan_retreat(state, config, float(up_m)), config)
-        except UnsafeMotion:
-            continue
-    return check_path(plan_retreat(state, config), config)
+    return _from_as_high_as_possible(lambda up_m: plan_retreat(state, config, up_m), config)
 
 
 def plan_retreat(state: ArmState, config: CellConfig, up_m: float = 0.0) -> MotionPlan:
@@ -89,13 +88,51 @@ def _lowest_rise(config: CellConfig) -> float:
     return config.motion.approach_m + GRASP_DEPTH_M
 
 
-def plan_recovery(state: ArmState, config: CellConfig) -> MotionPlan:
-    """Straight up and home, slowly, the fingers as they are, so that nothing falls; no step for an arm at home."""
+def check_recovery(state: ArmState, config: CellConfig) -> CheckedPlan:
+    """The way home after a stop, from wherever the arm stands; nobody looked, so it goes up as high as it can first.
+
+    Raises:
+        UnsafeMotion: the way is not safe.
+    """
+    checked = _from_as_high_as_possible(lambda up_m: plan_recovery(state, config, up_m), config)
+    plan = checked.plan
+    steps = tuple(_joints_slow(step, path) for step, path in zip(plan.steps, checked.joint_paths, strict=True))
+    return check_path(MotionPlan(plan.label, plan.q_start, steps), config)
+
+
+def _from_as_high_as_possible(plan_of: Callable[[float], MotionPlan], config: CellConfig) -> CheckedPlan:
+    """The plan that goes up highest, of those that are safe; `plan_of` makes it of a height above the table [m]."""
+    for up_m in np.arange(config.limits.z[1], _lowest_rise(config), -_RISE_STEP_M):
+        try:
+            return check_path(plan_of(float(up_m)), config)
+        except UnsafeMotion:
+            continue
+    return check_path(plan_of(0.0), config)
+
+
+def _joints_slow(step: Step, path: Array) -> Step:
+    """A step along whose joint path (N, 6) no joint turns fast, as the elbow of an arm that stretches does."""
+    if not isinstance(step, LinearMove) or len(path) < 2:
+        return step
+    start = (ur5e.forward(path[0]) @ rg2.T_FLANGE_TCP)[:3, 3]
+    piece_m = float(np.linalg.norm(step.T_base_tcp[:3, 3] - start)) / (len(path) - 1)
+    turn_rad = float(np.abs(np.diff(path, axis=0)).max())
+    return replace(step, speed_m_s=min(step.speed_m_s, SLOW_RAD_S * piece_m / turn_rad)) if turn_rad > 0 else step
+
+
+def plan_recovery(state: ArmState, config: CellConfig, up_m: float = 0.0) -> MotionPlan:
+    """Straight up and home, slowly, the fingers as they are, so that nothing falls; no step for an arm at home.
+
+    Args:
+        state: of the arm, as measured.
+        config: of the cell.
+        up_m: height above the table to go up to, if it is higher than a load needs [m].
+    """
     if at_home(state, config):
         return MotionPlan("recovery", state.q, ())
     home = home_move(config, LOAD_REACH_M)
     slow = replace(home, speed_rad_s=min(SLOW_RAD_S, home.speed_rad_s))
-    return MotionPlan("recovery", state.q, (*_slowly(_rise(state, config)), slow))
+    return MotionPlan("recovery", state.q, (*_slowly(_rise(state, config, up_m)), slow))
 
 
 def plan_feel(state: ArmState, config: CellConfig) -> MotionPlan:
@@ -104,9 +141,9 @@ def plan_feel(state: ArmState, config: CellConfig) -> MotionPlan:
     return MotionPlan("feel what is held", state.q, (*_rise(state, config), feel))
 
 
-def _rise(state: ArmState, config: CellConfig) -> tuple[LinearMove, ...]:
-    """Straight up until a load would pass over the walls of the bin."""
-    clear_z = config.table.height_m + carry_height(config)
+def _rise(state: ArmState, config: CellConfig, up_m: float = 0.0) -> tuple[LinearMove, ...]:
+    """Straight up until a load would pass over the walls of the bin, or higher."""
+    clear_z = config.table.height_m + max(up_m, carry_height(config))
     if state.T_base_tcp[2, 3] >= clear_z:
         return ()
     T_up = state.T_base_tcp.copy()
