@@ -42,7 +42,7 @@ _AZIMUTH_RAD = np.radians(15.0)
 _RADII_M = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
 _HEIGHTS_M = (0.20, 0.32, 0.44, 0.56, 0.68)
 # Poses straight above the ends of a way.
-_RISES_M = (0.08, 0.16, 0.24, 0.34, 0.44, 0.54)
+_RISES_M = (0.06, 0.12, 0.18, 0.24, 0.32, 0.40, 0.48)
 _NEIGHBOURS = 10
 # Ends of a way are connected with so many of the nearest poses.
 _NEAREST_TO_END = 24
