@@ -90,7 +90,7 @@ def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str, s
         raise UnsafeMotion(f"{label}: the board or the wrist would touch what may stand on the table")
     if seen is not None:
         corners = points.reshape(-1, 3)
-        if seen.gaps(corners, np.zeros(len(corners)), 0.0, _CLEARANCE_M).min() < _CLEARANCE_M:
+        if seen.gaps(corners, np.zeros(len(corners)), _ABOVE_TABLE_M, _CLEARANCE_M).min() < _CLEARANCE_M:
             raise UnsafeMotion(f"{label}: the board would touch what the camera saw on the table")
     for box in obstacles(config):
         if bodies.box_distance(*box.corners(), points).min() < _CLEARANCE_M:

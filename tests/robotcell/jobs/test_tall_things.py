@@ -31,16 +31,17 @@ if TYPE_CHECKING:
 
 @dataclass
 class OneGrasp:
-    """A policy that takes the goal in the middle, in one direction."""
+    """A policy that takes the goal in its middle or beside it, in one direction."""
 
     rotation: int
+    beside_m: float = 0.0
     name: str = "one grasp"
     workspace: Workspace = field(default_factory=Workspace)
 
     def decide(self, observation: Observation) -> Action:
         rows, cols = np.nonzero(observation.targets())
         x, y = observation.heightmap.workspace.position(float(rows.mean()), float(cols.mean()))
-        return Grasp(x, y, 0.05, self.rotation, 1.0)
+        return Grasp(x, y + self.beside_m, 0.05, self.rotation, 1.0)
 
 
 def post(x: float, y: float, height: float) -> SceneObject:
@@ -58,7 +59,7 @@ def test_a_goal_beside_a_post_is_picked_without_a_touch_and_its_plan_is_drawn(tm
     with Journal(f"sqlite:///{tmp_path}/journal.db") as journal, cell:
         decision, safe = preview(cell, OneGrasp(0), "red")
         assert isinstance(safe, CheckedPlan)
-        _, blocked = preview(cell, OneGrasp(4), "red")
+        _, blocked = preview(cell, OneGrasp(4, beside_m=0.03), "red")
         assert isinstance(blocked, Obstructed)
         assert np.hypot(blocked.obstruction.x + 0.5, blocked.obstruction.y - 0.1) < 0.07
         plain, crossed = (draw_preview(decision, plan, config, "dry run") for plan in (safe, blocked))
