@@ -14,9 +14,7 @@ from robotcell.config import load_config
 from robotcell.config.surroundings import bin_box
 from robotcell.geometry.transforms import make_transform
 from robotcell.jobs.policy_api import Observation, PickAny
-from robotcell.motion.actions import Action
 from robotcell.motion.grasp import Grasp
-from robotcell.motion.path_check import CheckedPlan
 from robotcell.motion.way import plan_way
 from robotcell.perception.clearance_map import build_clearance_map
 from sim_twin.devices.backend import open_twin
@@ -31,6 +29,8 @@ if TYPE_CHECKING:
 
     from robotcell.geometry.transforms import Array
     from robotcell.jobs.policy_api import Policy
+    from robotcell.motion.actions import Action
+    from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.view import View
 
 ROUNDS = 7
