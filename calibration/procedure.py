@@ -10,8 +10,8 @@ from calibration.collect.session import open_session, read_session
 from calibration.report.page import write_report
 from calibration.solve.pipeline import solve
 from calibration.solve.saving import save_if_better
+from robotcell.config.fingers import closed_width
 from robotcell.errors import ConfigError
-from robotcell.geometry.rg2 import MIN_WIDTH_M
 from robotcell.io.atomic_file import write_whole
 from robotcell.motion.config_check import check_config
 from robotcell.motion.path_check import check_path
@@ -152,5 +152,5 @@ def save_solution(solution: Solution, folder: Path, out: Path, tags: tuple[Fixed
 
 
 def _close_on_board(cell: Cell) -> None:
-    grip = Grip("hold the board", MIN_WIDTH_M, cell.config.gripper.force_n)
+    grip = Grip("hold the board", closed_width(cell.config), cell.config.gripper.force_n)
     cell.executor.run(check_path(MotionPlan("hold the board", cell.arm.state().q, (grip,)), cell.config))

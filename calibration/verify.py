@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.config.fingers import closed_width
 from robotcell.errors import CalibrationError, ConfigError
-from robotcell.geometry import rg2
 from robotcell.geometry.ur5e import inverse
 from robotcell.motion.executor import Ending
 from robotcell.motion.path_check import check_path
@@ -197,7 +197,7 @@ def go_above(cell: Cell, spot: Array, height_m: float) -> None:
     T_up = cell.arm.state().T_base_tcp
     T_up[2, 3] = max(T_up[2, 3], high[2, 3])
     steps: list[Step] = [
-        Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
+        Grip("close", closed_width(config), config.gripper.force_n),
         LinearMove("up", T_up, config.motion.guarded_speed_m_s, config.motion.linear_acceleration_m_s2),
         joint_move("go above", _solve(high, config), config),
         LinearMove("hover", low, config.motion.guarded_speed_m_s, config.motion.linear_acceleration_m_s2),

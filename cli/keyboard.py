@@ -59,7 +59,7 @@ class KeyboardHold:
         """Wait while the operator holds the job; whether that was so."""
         if self._may_go_on.is_set():
             return False
-        self._say("held: the arm stands at home; Space goes on")
+        self._say("held: the arm stands still; Space goes on")
         self._may_go_on.wait()
         return True
 

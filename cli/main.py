@@ -63,6 +63,13 @@ def pick(
         str | None,
         typer.Option(help="Who decides: learned, single-stage, grasp-only, heuristic, random.", show_default=False),
     ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(help="Share of its speed at which every motion is run, 0.05 to 1.", show_default=False),
+    ] = None,
+    confirm: Annotated[
+        bool, typer.Option("--confirm", help="Show each action and ask at the terminal before it is run.")
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Look, decide, plan, check and draw one action; move nothing.")
     ] = False,
@@ -75,8 +82,16 @@ def pick(
     """
     from cli.pick import run_pick
 
-    options = {"--scene": scene, "--meshes": meshes, "--objects": objects, "--seed": seed, "--policy": policy}
-    raise typer.Exit(run_pick(goal, all_, CellChoice(cell, settings, options), dry_run=dry_run, as_json=json_))
+    options = {
+        "--scene": scene,
+        "--meshes": meshes,
+        "--objects": objects,
+        "--seed": seed,
+        "--policy": policy,
+        "--speed": speed,
+    }
+    choice = CellChoice(cell, settings, options)
+    raise typer.Exit(run_pick(goal, all_, choice, confirm=confirm, dry_run=dry_run, as_json=json_))
 
 
 @app.command()

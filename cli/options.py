@@ -56,6 +56,7 @@ _KEYS = {
     "--objects": "backend.options.objects",
     "--seed": "backend.options.seed",
     "--policy": "policy.name",
+    "--speed": "motion.speed_fraction",
 }
 
 

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich.table import Table
 from rich.text import Text
 
 from cli.console import error_as_json, print_json, progress, report_error, results
+from cli.findings import print_findings
 from cli.keyboard import KeyboardHold
 from policy import make_policy
 from robotcell.config import find_backend
-from robotcell.errors import CellError, ConfigError, NoTarget, UnsafeMotion
+from robotcell.errors import CellError, ConfigError, NoTarget, StorageError, UnsafeMotion
+from robotcell.findings import Grade
 from robotcell.io.images import write_image
 from robotcell.jobs.job import Report, preview, resume_job, run_job
 from robotcell.jobs.journal import Journal
@@ -25,6 +29,7 @@ from robotcell.motion.grasp import Grasp
 from robotcell.perception.goals import goal_color
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from rich.console import Console
@@ -32,10 +37,12 @@ if TYPE_CHECKING:
 
     from cli.options import CellChoice
     from robotcell.config import CellConfig
+    from robotcell.findings import Finding
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.journal_tables import Job
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
+    from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.view import View
 
 
@@ -44,6 +51,7 @@ def run_pick(
     everything: bool,
     cell: CellChoice,
     *,
+    confirm: bool,
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -54,9 +62,12 @@ def run_pick(
         goals = _goals(goal, everything)
         config = cell.load()
         check_config(config)
+        if confirm and (dry_run or not sys.stdin.isatty()):
+            why = "a dry run moves nothing" if dry_run else "there is no terminal to ask at"
+            raise ConfigError(f"--confirm: {why}: leave it out")
         if dry_run:
             return _dry_run(goals, config, as_json=as_json)
-        report, error = _run(goals, None, config)
+        report, error = _run(goals, None, config, confirm=confirm)
     except CellError as refusal:
         error = refusal
     return _conclude(report, error, started, as_json=as_json)
@@ -69,6 +80,8 @@ def run_resume(job_id: int | None, cell: CellChoice, *, as_json: bool) -> int:
     try:
         config = cell.load()
         check_config(config)
+        if config.journal.url is None and not config.journal.default_file.exists():
+            raise ConfigError(f"there is no journal {config.journal.default_file}: start a job with robotcell pick")
         with Journal(config.journal.database_url()) as journal:
             job = _last_job(journal, config) if job_id is None else journal.job(job_id)
         config = config.model_copy(update={"policy": config.policy.model_copy(update={"name": job.policy})})
@@ -114,7 +127,7 @@ def _goals(goal: str | None, everything: bool) -> tuple[str, ...] | None:
 
 
 def _run(
-    goals: tuple[str, ...] | None, resumed: int | None, config: CellConfig
+    goals: tuple[str, ...] | None, resumed: int | None, config: CellConfig, *, confirm: bool = False
 ) -> tuple[Report | None, CellError | None]:
     """Run a job to its end, a new one or one that is resumed; the report, and the error that stopped it.
 
@@ -126,12 +139,14 @@ def _run(
         journal = stack.enter_context(Journal(config.journal.database_url()))
         status = stack.enter_context(err.status(f"opening the cell ({config.backend.name})"))
         cell = stack.enter_context(open_cell(config))
-        pictures, following = JobPictures(config), _Progress(err, status)
+        pictures, following = JobPictures(config), _Progress(config, err, status)
         error = None
         try:
-            hold = stack.enter_context(KeyboardHold(following.tell))
+            # Whoever is asked before each action answers at the keyboard, and holds the job by not answering.
+            hold = None if confirm else stack.enter_context(KeyboardHold(following.tell))
             if resumed is None:
-                report = run_job(cell, policy, journal, goals, (pictures, following), hold)
+                ask = following.ask if confirm else None
+                report = run_job(cell, policy, journal, goals, (pictures, following), hold, ask)
             else:
                 report = resume_job(cell, policy, journal, resumed, (pictures, following), hold)
         except CellError as stop:
@@ -143,7 +158,9 @@ def _run(
                 job_id, run_dir, False, str(stop), journal.metrics(job_id), journal.job(job_id).cell_s or 0.0
             )
         status.update("drawing the summary")
-        pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
+        # What stopped the job says more than pictures that cannot be written.
+        with nullcontext() if error is None else suppress(StorageError):
+            pictures.finish("complete" if report.completed else f"not complete: {report.reason}")
         return report, error
 
 
@@ -190,7 +207,8 @@ def _as_json(action: Action) -> dict[str, Any]:
 class _Progress:
     """Prints a line per action while the job runs."""
 
-    def __init__(self, console: Console, status: Status) -> None:
+    def __init__(self, config: CellConfig, console: Console, status: Status) -> None:
+        self._config = config
         self._console = console
         self._status = status
         # The job's number and folder, once it has started.
@@ -206,6 +224,13 @@ class _Progress:
         """Print what the operator did."""
         self._console.print(words, style="bold")
 
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """Print what the preflight found that could be better; what refuses the job is the error that ends it."""
+        notes = [finding for finding in findings if finding.grade is Grade.NOTE]
+        self._console.print(Text(f"preflight: {len(findings)} findings, {len(notes)} of them notes"))
+        if notes:
+            print_findings(notes, self._console)
+
     def looked(self, view: View) -> None:
         """Show what is on the table."""
         count = len(view.segmentation.instances)
@@ -214,6 +239,22 @@ class _Progress:
     def decided(self, decision: Decision) -> None:
         """Show the action that runs."""
         self._status.update(describe(decision))
+
+    def ask(self, decision: Decision, checked: CheckedPlan) -> bool:
+        """Show an action and ask at the terminal whether it shall run; an interrupt ends the job."""
+        page = draw_preview(decision, checked, self._config, f"{describe(decision)}: to be confirmed")
+        if self.job is not None:
+            path = self.job[1] / f"confirm-{decision.index:03d}.png"
+            write_image(path, page)
+            self._console.print(Text(f"picture: {path}"), soft_wrap=True)
+        self._console.print(Text(f"steps: {', '.join(step.label for step in checked.plan.steps)}"), soft_wrap=True)
+        self._status.stop()
+        try:
+            return typer.confirm(f"{describe(decision)}: run it? (n: another one, Ctrl-C: end the job)", err=True)
+        except typer.Abort:
+            raise KeyboardInterrupt from None
+        finally:
+            self._status.start()
 
     def ended(self, decision: Decision, outcome: Outcome) -> None:
         """Print what came of it."""

@@ -11,12 +11,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.config.fingers import gripper_range
 from robotcell.geometry import rg2
 from robotcell.motion.grasp import GRASP_DEPTH_M
 from robotcell.motion.rotations import GRASP_ROTATIONS, rotation_angle_rad
 
 if TYPE_CHECKING:
     from policy.shadows import CompletedHeights
+    from robotcell.config import CellConfig
 
 # Fingers keep this distance from what they pass, over their own size: calibration, depth noise, half a cell.
 _SIDE_MARGIN_M = 0.003
@@ -35,12 +37,25 @@ class OpenGripper:
     """The gripper as it comes down for a grasp.
 
     Attributes:
-        opening_m: pre-shaped opening.
+        opening_m: pre-shaped opening between the tips.
         tip_clearance_m: lowest height of the tcp above the table.
+        fingertip_offset_m: how far each mounted tip reaches inwards from the bare finger.
     """
 
     opening_m: float
     tip_clearance_m: float
+    fingertip_offset_m: float = 0.0
+
+    @classmethod
+    def of(cls, config: CellConfig) -> OpenGripper:
+        """That of a cell."""
+        use = config.gripper
+        return cls(use.preshape_m, use.tip_clearance_m, gripper_range(config).fingertip_offset_m)
+
+    @property
+    def thickness_m(self) -> float:
+        """Of a finger with its tip."""
+        return rg2.finger_thickness(self.fingertip_offset_m)
 
 
 @dataclass(frozen=True)
@@ -68,10 +83,10 @@ class PaddedMaps:
 
 
 def pad_maps(
-    heights: CompletedHeights, owner: npt.NDArray[np.int32], resolution_m: float, opening_m: float
+    heights: CompletedHeights, owner: npt.NDArray[np.int32], resolution_m: float, gripper: OpenGripper
 ) -> PaddedMaps:
-    """Pad the heights and the labels of the objects for grasps with that opening."""
-    reach = math.hypot(max(opening_m / 2 + rg2.FINGER_THICKNESS_M, SAMPLED_M), SAMPLED_M) + _PAD_MARGIN_M
+    """Pad the heights and the labels of the objects for grasps with that gripper."""
+    reach = math.hypot(max(gripper.opening_m / 2 + gripper.thickness_m, SAMPLED_M), SAMPLED_M) + _PAD_MARGIN_M
     pad = math.ceil(reach / resolution_m)
     return PaddedMaps(
         height_m=np.pad(heights.height_m, pad),
@@ -89,9 +104,9 @@ def smoothed_tops(height_m: npt.NDArray[np.float32], resolution_m: float) -> npt
     return np.asarray(cv2.medianBlur(height_m, size), np.float32)
 
 
-def finger_reach_m(opening_m: float) -> float:
+def finger_reach_m(gripper: OpenGripper) -> float:
     """Distance [m] from the centre of a grasp to the farthest corner that a finger needs room at."""
-    along = opening_m / 2 + rg2.FINGER_THICKNESS_M + _SIDE_MARGIN_M
+    along = gripper.opening_m / 2 + gripper.thickness_m + _SIDE_MARGIN_M
     return math.hypot(along, rg2.FINGER_BREADTH_M / 2 + _SIDE_MARGIN_M)
 
 
@@ -112,10 +127,12 @@ def finger_clearance(
 ) -> npt.NDArray[np.float32]:
     """(N,) 0..1: whether the open fingers of grasps at (N,) cells and rotations come down without touching anything."""
     center = maps.flat_index(row, col)
-    tip = tcp_height_m(maps, row, col, gripper) + np.float32(rg2.tip_retraction(gripper.opening_m))
+    tip = tcp_height_m(maps, row, col, gripper) + np.float32(
+        rg2.tip_retraction(gripper.opening_m, gripper.fingertip_offset_m)
+    )
     stride = maps.height_m.shape[1]
-    bare = _finger_offsets(stride, maps.resolution_m, gripper.opening_m, 0.0)
-    wide = _finger_offsets(stride, maps.resolution_m, gripper.opening_m, _SIDE_MARGIN_M)
+    bare = _finger_offsets(stride, maps.resolution_m, gripper, 0.0)
+    wide = _finger_offsets(stride, maps.resolution_m, gripper, _SIDE_MARGIN_M)
     heights, ceilings = maps.height_m.ravel(), maps.ceiling_m.ravel()
     free = tip - heights[center[:, None] + bare[rotation]].max(axis=1)
     clearance = np.zeros(len(center), np.float32)
@@ -152,9 +169,10 @@ def grid_offsets(
 
 
 @lru_cache(maxsize=64)
-def _finger_offsets(stride: int, resolution_m: float, opening_m: float, margin_m: float) -> npt.NDArray[np.intp]:
+def _finger_offsets(stride: int, resolution_m: float, gripper: OpenGripper, margin_m: float) -> npt.NDArray[np.intp]:
     """(K, N) flat offsets of the cells under both fingers, from the centre of the grasp, in every direction."""
-    along = _spaced(rg2.FINGER_THICKNESS_M / 2 + margin_m, resolution_m) + opening_m / 2 + rg2.FINGER_THICKNESS_M / 2
+    half = gripper.thickness_m / 2
+    along = _spaced(half + margin_m, resolution_m) + gripper.opening_m / 2 + half
     across = _spaced(rg2.FINGER_BREADTH_M / 2 + margin_m, resolution_m)
     both = np.concatenate([along, -along])
     return np.stack([grid_offsets(k, both, across, stride, resolution_m) for k in range(GRASP_ROTATIONS)])

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.config import find_backend
-from robotcell.errors import ConnectionLost, DeviceFault
+from robotcell.config.fingers import finger_problems
+from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
 from robotcell.io.lock_file import LockFile
 from robotcell.motion.executor import Execution, Executor
 from robotcell.motion.guard import Latch
 from robotcell.motion.path_check import check_path
 from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.recorder import Recorder
 from robotcell.motion.retreat import check_retreat, plan_recovery
 from robotcell.perception.view import View, look
 
@@ -43,6 +45,7 @@ class Cell:
         latch: remembers a safety stop until an operator recovers the cell.
         lock: that this process owns while the cell is open; None where nobody else can open it.
         lasting: whether the cell is still there when this process has ended; a simulated one is not.
+        recorder: where the last second before a stop is written.
     """
 
     config: CellConfig
@@ -50,6 +53,7 @@ class Cell:
     latch: Latch = field(default_factory=Latch)
     lock: LockFile | None = None
     lasting: bool = False
+    recorder: Recorder = field(default_factory=Recorder)
 
     @property
     def arm(self) -> Arm:
@@ -74,7 +78,7 @@ class Cell:
     @property
     def executor(self) -> Executor:
         """What runs checked plans on this cell."""
-        return Executor(self.devices, self.config, self.latch)
+        return Executor(self.devices, self.config, self.latch, self.recorder)
 
     def look(self, workspace: Workspace | None = None) -> View:
         """Read the camera and see what is on the table; see `robotcell.perception.view.look`.
@@ -224,7 +228,8 @@ class Cell:
             ConnectionLost, DeviceFault: the failure of the one device that failed, or all of them together
                 (as DeviceFault if every device could be reached); or another process has the cell.
             StorageError: the lock or the latch cannot be read.
-            ConfigError: a backend finds its own settings wrong, at the first device.
+            ConfigError: a backend finds its own settings wrong, at the first device; or the mounted finger tips cannot
+                reach what the cell's file asks of them.
         """
         failures: list[tuple[str, ConnectionLost | DeviceFault]] = []
         try:
@@ -237,6 +242,8 @@ class Cell:
         except BaseException:
             self.close()
             raise
+        if not failures:
+            self._check_fingers()
         if failures:
             self.close()
             if len(failures) == 1:
@@ -244,6 +251,16 @@ class Cell:
             kind = ConnectionLost if any(isinstance(e, ConnectionLost) for _, e in failures) else DeviceFault
             raise kind("\n  ".join(["the cell cannot be opened:", *(f"{name}: {error}" for name, error in failures)]))
         return self
+
+    def _check_fingers(self) -> None:
+        try:
+            problems = finger_problems(self.config, self.gripper.range())
+        except BaseException:
+            self.close()
+            raise
+        if problems:
+            self.close()
+            raise ConfigError("\n  ".join(["the cell cannot be opened:", *problems]))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

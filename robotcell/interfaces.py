@@ -15,9 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
     from types import TracebackType
 
     from typing_extensions import Self
+
+    from robotcell.findings import Finding
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -71,6 +74,25 @@ class GripperState:
     width_m: float
     busy: bool
     grip_detected: bool
+
+
+@dataclass(frozen=True)
+class GripperRange:
+    """What a gripper can do with the finger tips that are mounted on it.
+
+    Attributes:
+        fingertip_offset_m: how far each tip reaches inwards from the bare finger, outwards where negative.
+        min_width_m: between the tips of the fingers when they are closed as far as they go.
+        max_width_m: the same when they are wide open.
+        min_force_n: of a grip.
+        max_force_n: of a grip.
+    """
+
+    fingertip_offset_m: float
+    min_width_m: float
+    max_width_m: float
+    min_force_n: float
+    max_force_n: float
 
 
 @dataclass(frozen=True)
@@ -145,6 +167,35 @@ class Device(Protocol):
         self.close()
 
 
+@dataclass(frozen=True)
+class JointWaypoint:
+    """One leg of a path: a joint-space motion to q (6,) [rad], the leading joint at the given speed and acceleration.
+
+    Within `blend_m` of its end the tcp may leave it for the next leg; 0: it comes to rest there.
+    """
+
+    q: Array
+    speed_rad_s: float
+    acceleration_rad_s2: float
+    blend_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class LinearWaypoint:
+    """One leg of a path: a straight motion of the tcp to `T_base_tcp` (4, 4), rotation interpolated.
+
+    Within `blend_m` of its end the tcp may leave it for the next leg; 0: it comes to rest there.
+    """
+
+    T_base_tcp: Array
+    speed_m_s: float
+    acceleration_m_s2: float
+    blend_m: float = 0.0
+
+
+Waypoint: TypeAlias = JointWaypoint | LinearWaypoint
+
+
 class Arm(Device, Protocol):
     """A six-joint arm. Motions return at once; the caller supervises them with `moving`, `state`, `kick` and `stop`.
 
@@ -164,6 +215,14 @@ class Arm(Device, Protocol):
         """The newest measurement."""
         ...
 
+    def report(self) -> tuple[Finding, ...]:
+        """What the arm says of its own settings that a motion depends on; nothing where it cannot be asked.
+
+        Payload and tool centre point as they are read back, remote control, speed slider. Takes some tens of
+        milliseconds, and is asked before a job.
+        """
+        ...
+
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint-space motion to q (6,) [rad], the leading joint at the given speed."""
         ...
@@ -173,6 +232,14 @@ class Arm(Device, Protocol):
 
         Only the ranges of the arguments are checked here: a line that the arm cannot follow ends in a stop that must be
         recovered. `robotcell.motion.path_check` finds such lines before anything moves.
+        """
+        ...
+
+    def start_path(self, waypoints: Sequence[Waypoint]) -> None:
+        """Start one motion along several legs, with rounded corners (`robotcell.geometry.rounded_path`).
+
+        What `start_joints` and `start_linear` say of their arguments holds for each leg. The last waypoint has no
+        `blend_m`: the motion ends there, at rest.
         """
         ...
 
@@ -198,6 +265,10 @@ class Gripper(Device, Protocol):
 
     def state(self) -> GripperState:
         """The newest measurement."""
+        ...
+
+    def range(self) -> GripperRange:
+        """What it can reach, with the finger tips that it has."""
         ...
 
     def start_width(self, width_m: float, force_n: float) -> None:
@@ -231,6 +302,18 @@ class Camera(Device, Protocol):
         Raises:
             ConnectionLost: no frame came.
             DeviceFault: the device delivers stale or unusable frames.
+        """
+        ...
+
+    def poll(self, since: float) -> Callable[[], RgbdFrame] | None:
+        """A frame that was captured at `since` [s] on the cell's clock or later; None until there is one.
+
+        Returns at once, so that it can be called while the arm is supervised. What it returns makes the images; it
+        takes its time, touches no device, and may be called in another thread before the camera is used again.
+
+        Raises:
+            ConnectionLost: the camera is not connected, or no frame comes.
+            DeviceFault: as `read`; from what is returned as well.
         """
         ...
 

@@ -79,6 +79,7 @@ class TwinOptions(BaseModel):
         seed: of the scene and of the camera's noise; the same seed gives the same job.
         meshes: folder of the mesh files that a scene file names.
         noise: what the camera adds to the truth.
+        fingertip_offset_m: how far each mounted finger tip reaches inwards from the bare finger.
         board: the gripper holds the calibration board (docs/how-to/calibrate.md), a little differently for each seed.
         tag: a tag lies on the table beside the workspace, as one that is fixed to a cell (robotcell.perception.tags).
         camera_offset: how far the camera really stands from where `camera` has it without a calibration: position [m]
@@ -94,6 +95,7 @@ class TwinOptions(BaseModel):
     seed: Annotated[int, Field(ge=0)] = 0
     meshes: Path | None = None
     noise: NoiseOptions = NoiseOptions()
+    fingertip_offset_m: Annotated[float, Field(ge=-0.008, le=0.04)] = 0.0
     board: bool = False
     tag: bool = False
     camera_offset: tuple[float, float, float, float, float, float] = (0.0,) * 6

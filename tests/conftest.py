@@ -23,8 +23,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# Examples are derived from the test itself, so a run is repeatable; a shared machine makes deadlines meaningless.
-settings.register_profile("repeatable", derandomize=True, deadline=None)
+# Examples are derived from the test itself, so a run is repeatable: what a further run would add are the same ones. A
+# shared machine makes deadlines meaningless.
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
 settings.load_profile("repeatable")
 
 # pybullet numbers its clients from 0 and reuses the numbers of closed ones.

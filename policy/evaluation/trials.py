@@ -25,12 +25,15 @@ from robotcell.perception.colors import PALETTE
 from sim_twin.devices.backend import open_twin
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     import numpy.typing as npt
 
     from policy.evaluation.suites import Case
     from robotcell.cell import Cell
     from robotcell.config import CellConfig
+    from robotcell.findings import Finding
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.policy_api import Action, Observation, Policy
     from robotcell.jobs.verdict import Outcome
@@ -267,6 +270,9 @@ class _Watcher:
     def started(self, job_id: int, run_dir: Path) -> None:
         """Take the number of the job."""
         self.job_id = job_id
+
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """A trial that is refused says so by its error."""
 
     def looked(self, view: View) -> None:
         """Keep the newest view; see by the first one whether the goal can be asked for."""

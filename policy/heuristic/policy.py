@@ -44,7 +44,7 @@ class HeuristicPolicy:
         self._camera = config.camera.pose()[:3, 3]
         self._table_height_m = config.table.height_m
         self._push_m = config.motion.push_m
-        self._gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+        self._gripper = OpenGripper.of(config)
 
     @property
     def workspace(self) -> Workspace:
@@ -77,7 +77,7 @@ class HeuristicPolicy:
         """The best grasp that repeats no failure."""
         heightmap = observation.heightmap
         heights = complete_heights(heightmap, self._camera, self._table_height_m)
-        maps = pad_maps(heights, _owners(observation), RESOLUTION_M, self._gripper.opening_m)
+        maps = pad_maps(heights, _owners(observation), RESOLUTION_M, self._gripper)
         found = antipodal_grasps(maps, targets, self._gripper)
         score = found.score.copy()
         x, y = cell_centers(heightmap.workspace, found.row, found.col)

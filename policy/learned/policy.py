@@ -65,9 +65,9 @@ class LearnedPolicy:
         self._table_height_m = config.table.height_m
         self._push_m = config.motion.push_m
         self._camera = config.camera.pose()[:3, 3]
-        self._gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+        self._gripper = OpenGripper.of(config)
         # As far from a grasp as its fingers reach.
-        reach = math.ceil(finger_reach_m(self._gripper.opening_m) / RESOLUTION_M)
+        reach = math.ceil(finger_reach_m(self._gripper) / RESOLUTION_M)
         self._reach = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
 
     @property
@@ -114,7 +114,7 @@ class LearnedPolicy:
             return None
         near = cv2.dilate(targets.astype(np.uint8), self._reach) > 0
         heights = complete_heights(heightmap, self._camera, self._table_height_m, near)
-        maps = pad_maps(heights, observation.labels, RESOLUTION_M, self._gripper.opening_m)
+        maps = pad_maps(heights, observation.labels, RESOLUTION_M, self._gripper)
         clearance = np.maximum(finger_clearance(maps, rows, cols, rotation, self._gripper), np.float32(_BLOCKED))
         values = values * clearance**_CLEARANCE_POWER
         chosen = int(values.argmax())

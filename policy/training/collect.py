@@ -320,8 +320,8 @@ def _random_cell(mask: npt.NDArray[np.bool_], rng: np.random.Generator) -> tuple
 def _geometric(state: State, config: CellConfig, rng: np.random.Generator) -> list[_Choice]:
     """Grasps that look possible, the better ones more often."""
     heights = complete_heights(state.heightmap, config.camera.pose()[:3, 3], config.table.height_m)
-    gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
-    maps = pad_maps(heights, state.labels.astype(np.int32), RESOLUTION_M, gripper.opening_m)
+    gripper = OpenGripper.of(config)
+    maps = pad_maps(heights, state.labels.astype(np.int32), RESOLUTION_M, gripper)
     found = antipodal_grasps(maps, state.labels > 0, gripper)
     likely = np.flatnonzero(found.score > 0)
     if not len(likely):

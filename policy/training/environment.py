@@ -24,6 +24,7 @@ from policy.push.border import USEFUL_GAIN, border_occupancy
 from policy.push.line import PushLine, free_to_descend, push_line
 from policy.training.scenes import training_scene
 from robotcell.config import CameraMount, CellConfig
+from robotcell.config.fingers import closed_width
 from robotcell.errors import ConfigError
 from robotcell.geometry.transforms import look_at, make_transform
 from robotcell.motion.executor import Ending
@@ -309,7 +310,7 @@ class PushGraspEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.int64]]
         x, y = workspace.position(line.row, line.col)
         theta = rotation_angle_rad(rotation)
         tcp_z = table + push_height(line.top_m, config)
-        near_z = near_height(state.heightmap, x, y, theta, 0.0, tcp_z, config)
+        near_z = near_height(state.heightmap, x, y, theta, closed_width(config), tcp_z, config)
         length = (len(line.cells) - 1) * RESOLUTION_M
         before = gripper.save()
         attempt = gripper.push((x, y), theta, length, near_z, tcp_z)

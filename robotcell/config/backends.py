@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from robotcell.config.schema import CellConfig
-    from robotcell.interfaces import Devices
+    from robotcell.interfaces import Devices, GripperRange
 
 
 class Backend(Protocol):
@@ -32,7 +33,13 @@ class Backend(Protocol):
         """
         ...
 
+    @staticmethod
+    def gripper_range(config: CellConfig) -> GripperRange:
+        """What the gripper of a cell can reach, by its options alone; its device reports the same once connected."""
+        ...
 
+
+@lru_cache
 def find_backend(name: str) -> Backend:
     """The backend of that name.
 

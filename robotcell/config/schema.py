@@ -112,6 +112,9 @@ class Motion(_Table):
     linear_speed_m_s: Annotated[float, Field(gt=0, le=1)] = 0.4
     # Acceleration of the tcp on straight lines; the default is Universal Robots' own for movel.
     linear_acceleration_m_s2: Annotated[float, Field(gt=0, le=10)] = 1.2
+    # Share of its speed at which every motion is run: the same way, and as much more time for it. Accelerations are
+    # lowered by its square. `robotcell pick --speed` sets it.
+    speed_fraction: Annotated[float, Field(ge=0.05, le=1)] = 1.0
     # Speed of the last part of a descent, and of a push. A finger that lands on a block is stopped at 30 to 85 N
     # (measured in the twin; 90 N at 0.10, 75 N at 0.06).
     guarded_speed_m_s: Annotated[float, Field(gt=0, le=0.25)] = 0.08
@@ -142,9 +145,15 @@ class Limits(_Table):
     joint_speed_rad_s: Annotated[float, Field(gt=0, le=3.14)] = 2.0
     # The same for the tool.
     tool_speed_m_s: Annotated[float, Field(gt=0, le=3)] = 1.5
-    # A force on the tool that stops the cell. The default is below the 150 N at which a UR5e's factory safety preset
-    # stops the arm.
+    # A force on the tool that stops the cell during a guarded motion, which ends by itself at motion.contact_force_n,
+    # and while something is carried: loads that are not held firmly strike the fingers with up to 72 N (novel objects,
+    # measured in the twin). The default is below the 150 N at which a UR5e's factory safety preset stops the arm.
     force_n: Annotated[float, Field(gt=0, le=250)] = 100.0
+    # The same in free motions, where nothing is to be touched, if it is lower. Those of the twin feel nothing; what a
+    # UR5e reports of a tool in free air scatters by some newtons. Half of it for 0.3 s stops the cell too.
+    free_force_n: Annotated[float, Field(gt=0, le=250)] = 50.0
+    # The same while the fingers move, which open by themselves at motion.closing_force_n. Below the controller's 150 N.
+    grip_force_n: Annotated[float, Field(gt=0, le=250)] = 140.0
     # Smallest singular value of the Jacobian on straight lines.
     singularity: Annotated[float, Field(ge=0, le=0.2)] = 0.02
     # Distance that arm and gripper keep from keep-outs and from themselves.

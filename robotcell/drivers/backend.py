@@ -11,7 +11,8 @@ from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415, D415Options
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
-from robotcell.interfaces import Devices
+from robotcell.geometry import rg2
+from robotcell.interfaces import Devices, GripperRange
 
 if TYPE_CHECKING:
     from robotcell.config import CellConfig
@@ -54,3 +55,9 @@ class HardwareBackend:
             # Whatever it is, connecting will say what is wrong with it.
             return f"arm-{host.lower()}"
         return f"arm-{min(str(address[4][0]) for address in found)}"
+
+    @staticmethod
+    def gripper_range(config: CellConfig) -> GripperRange:
+        """What the RG2 reaches with the tips that the options say are mounted."""
+        options = HardwareOptions.model_validate(config.backend.options)
+        return rg2.range_with_tips(options.gripper.fingertip_offset_m)

@@ -223,8 +223,9 @@ def blocks_view(
     x_range: tuple[float, float],
     y_range: tuple[float, float],
     table_height_m: float,
+    load_m: float = 0.0,
 ) -> bool:
-    """Whether arm or gripper stand between a camera and a rectangle of the table.
+    """Whether arm, gripper or a load stand between a camera and a rectangle of the table.
 
     Args:
         q: joint angles (6,) [rad].
@@ -232,11 +233,12 @@ def blocks_view(
         x_range: of the rectangle, base frame [m].
         y_range: likewise.
         table_height_m: z of the table, base frame.
+        load_m: how far a load reaches from the tcp, down and to any side; 0 without one.
     """
     T_tcp = ur5e.forward(q) @ rg2.T_FLANGE_TCP
     fingers = finger_points(T_tcp, 0.0)
-    centers = np.concatenate([sphere_centers(q), fingers])
-    radii = np.concatenate([SPHERES.radius, np.full(len(fingers), FINGER_SPACING_M)])
+    centers = np.concatenate([sphere_centers(q), fingers, T_tcp[None, :3, 3]])
+    radii = np.concatenate([SPHERES.radius, np.full(len(fingers), FINGER_SPACING_M), [load_m]])
     below = centers[:, 2] < eye[2] - radii
     away = centers[below] - eye
     # Their shadows on the table, as if the camera were a lamp.

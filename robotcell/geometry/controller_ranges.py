@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,11 +11,19 @@ import numpy as np
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import ur5e
 from robotcell.geometry.transforms import check_transform
+from robotcell.interfaces import JointWaypoint, LinearWaypoint
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy.typing as npt
 
     from robotcell.geometry.transforms import Array
+    from robotcell.interfaces import Waypoint
+
+# No corner is rounded further away from it; also no path of more legs is taken. Ours, not the controller's.
+_MAX_BLEND_M = 2.0
+_MAX_LEGS = 100
 
 
 def check_joint_motion(q: npt.ArrayLike, speed_rad_s: float, acceleration_rad_s2: float) -> Array:
@@ -49,6 +58,33 @@ def check_linear_motion(T_base_tcp: npt.ArrayLike, speed_m_s: float, acceleratio
     _check_range("speed", speed_m_s, ur5e.MAX_TOOL_SPEED, "m/s")
     _check_range("acceleration", acceleration_m_s2, ur5e.MAX_TOOL_ACCELERATION, "m/s^2")
     return target
+
+
+def check_path_motion(waypoints: Sequence[Waypoint]) -> tuple[Waypoint, ...]:
+    """The waypoints, their targets as arrays.
+
+    Raises:
+        UnsafeMotion: there are none or too many, a leg is outside the controller's range (`check_joint_motion`,
+            `check_linear_motion`), or a blend radius is negative or no number, or the last one is above 0.
+    """
+    if not 1 <= len(waypoints) <= _MAX_LEGS:
+        raise UnsafeMotion(f"a path of {len(waypoints)} legs: it must have 1 to {_MAX_LEGS}")
+    checked: list[Waypoint] = []
+    for i, waypoint in enumerate(waypoints):
+        allowed = _MAX_BLEND_M if i < len(waypoints) - 1 else 0.0
+        if not 0 <= waypoint.blend_m <= allowed:
+            raise UnsafeMotion(
+                f"leg {i + 1} of a path: blend radius {waypoint.blend_m} m is outside 0 to {allowed:g} m"
+            )
+        if isinstance(waypoint, JointWaypoint):
+            q = check_joint_motion(waypoint.q, waypoint.speed_rad_s, waypoint.acceleration_rad_s2)
+            checked.append(replace(waypoint, q=q))
+        elif isinstance(waypoint, LinearWaypoint):
+            T = check_linear_motion(waypoint.T_base_tcp, waypoint.speed_m_s, waypoint.acceleration_m_s2)
+            checked.append(replace(waypoint, T_base_tcp=T))
+        else:
+            raise TypeError(f"{type(waypoint).__name__} is no waypoint")
+    return tuple(checked)
 
 
 def _check_range(what: str, value: float, high: float, unit: str) -> None:

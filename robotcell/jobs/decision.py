@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
+    from robotcell.findings import Finding
     from robotcell.jobs.policy_api import Task
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
+    from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.view import View
 
 
@@ -34,10 +37,18 @@ class Decision:
 
 
 class Hold(Protocol):
-    """Lets an operator hold a job between two of its actions, where the arm stands at home and the gripper is empty."""
+    """Lets an operator hold a job between two of its actions, while the arm stands still and the gripper is empty."""
 
     def __call__(self) -> bool:
         """Return at once, or wait until the job may go on; whether it waited, and the table may have changed."""
+        ...
+
+
+class Confirm(Protocol):
+    """Asks somebody before an action is run."""
+
+    def __call__(self, decision: Decision, checked: CheckedPlan) -> bool:
+        """Whether the plan of a decision, which was found safe, shall run; if not, another action is decided."""
         ...
 
 
@@ -46,6 +57,10 @@ class Observer(Protocol):
 
     def started(self, job_id: int, run_dir: Path) -> None:
         """The job is in the journal and its folder is made."""
+        ...
+
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """The preflight is over; a job that it refuses ends now."""
         ...
 
     def looked(self, view: View) -> None:

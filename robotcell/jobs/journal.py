@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import create_engine, event, func, select
+from sqlalchemy import create_engine, event, func, select, update
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from sqlalchemy.orm import Session
@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 # How long a SQLite file may be locked by others before that is an error. A write takes milliseconds; a stopped arm must
 # not wait long for its record.
 _LOCKED_S = 2.0
+
+
+# Results of actions in which nothing moved (`robotcell.jobs.verdict.Result`).
+NOT_RUN = ("refused", "declined")
 
 
 @dataclass(frozen=True)
@@ -102,6 +106,15 @@ class Journal:
     def close(self) -> None:
         """Release the database; idempotent."""
         self._engine.dispose()
+
+    def check_writable(self) -> None:
+        """See whether the database takes a row, without leaving one.
+
+        Raises:
+            StorageError: it does not.
+        """
+        with self._writing() as session:
+            session.execute(update(Job).where(Job.id == -1).values(reason=""))
 
     def start_job(
         self,
@@ -207,7 +220,7 @@ class Journal:
         ended = (
             select(ActionRow.primitive, OutcomeRow.success, OutcomeRow.picked)
             .join(OutcomeRow)
-            .where(ActionRow.job_id == job_id, OutcomeRow.result != "refused")
+            .where(ActionRow.job_id == job_id, OutcomeRow.result.not_in(NOT_RUN))
             .order_by(ActionRow.id)
         )
         with self._reading() as session:

@@ -53,7 +53,8 @@ class Job(Base):
     config: Mapped[dict[str, Any]] = mapped_column(JSON)
     # Folder of the run.
     run_dir: Mapped[str]
-    # running, complete, incomplete or stopped. A job that was killed stays at running; its lock tells.
+    # running, complete, incomplete, stopped, or refused (before it began: what was wrong is the reason). A job that was
+    # killed stays at running; its lock tells.
     status: Mapped[str] = mapped_column(default="running")
     # Why it is not complete.
     reason: Mapped[str] = mapped_column(default="")
@@ -148,7 +149,7 @@ class OutcomeRow(Base):
     detail: Mapped[str]
     # Largest contact force of guarded motions; null where it is not known.
     peak_force_n: Mapped[float | None]
-    # Largest contact force while the fingers moved; null where it is not known.
+    # Largest contact force while the fingers gripped; null where they did not, or it is not known.
     grip_force_n: Mapped[float | None]
     # Time of the end on the cell's clock [s].
     ended_s: Mapped[float]

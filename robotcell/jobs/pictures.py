@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from robotcell.config.fingers import gripper_range
 from robotcell.errors import StorageError
 from robotcell.geometry import rg2
 from robotcell.io.images import write_image
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from robotcell.config import CellConfig
     from robotcell.errors import UnsafeMotion
+    from robotcell.findings import Finding
     from robotcell.jobs.decision import Decision
     from robotcell.jobs.verdict import Outcome
     from robotcell.motion.actions import Action
@@ -59,6 +61,9 @@ class JobPictures:
     def started(self, job_id: int, run_dir: Path) -> None:
         """Take the folder of the run."""
         self._folder = run_dir
+
+    def checked(self, findings: Sequence[Finding]) -> None:
+        """There is nothing to draw yet."""
 
     def looked(self, view: View) -> None:
         """Keep the newest view for the last page."""
@@ -210,9 +215,10 @@ def _draw_fingers(panel: _Picture, grasp: Grasp, config: CellConfig, pixel: _ToP
     along = np.array([np.cos(grasp.theta), np.sin(grasp.theta)])
     across = np.array([-along[1], along[0]]) * rg2.FINGER_BREADTH_M / 2
     inner = config.gripper.preshape_m / 2
+    thickness = rg2.finger_thickness(gripper_range(config).fingertip_offset_m)
     for side in (-1, 1):
         near = np.array([x, y]) + side * inner * along
-        far = near + side * rg2.FINGER_THICKNESS_M * along
+        far = near + side * thickness * along
         corners = [pixel(*p) for p in (near - across, near + across, far + across, far - across)]
         cv2.fillPoly(panel, [np.array(corners)], _ACTION, cv2.LINE_AA)
         cv2.line(panel, pixel(x, y), pixel(*near), _ACTION, 2, cv2.LINE_AA)

@@ -52,6 +52,8 @@ class Progress:
         """
         if outcome.result is Result.PICKED and goal is not None:
             return Progress(self.goals + 1)
+        if outcome.result is Result.DECLINED:
+            return replace(self, barred=(*self.barred, action))
         place = task.mask if isinstance(task, PickGoal) else self.place
         if place is not None:
             place = place_after(place, action, outcome.result, workspace)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import narrowest_hold
 from robotcell.errors import ConfigError, DeviceFault, NoTarget
 from robotcell.jobs.journal_tables import GOAL, UNCOVER, action_of
 from robotcell.jobs.ownership import Life, life
@@ -87,7 +88,7 @@ def settle(cell: Cell, grasp: Grasp | None, held: Callable[[str], None] | None) 
     config = cell.config
     cell.executor.run(check_path(plan_feel(cell.arm.state(), config), config))
     width = cell.gripper.state().width_m
-    if width < config.gripper.empty_width_m:
+    if width < narrowest_hold(config):
         cell.home()
         return None
     if grasp is None:
@@ -96,7 +97,9 @@ def settle(cell: Cell, grasp: Grasp | None, held: Callable[[str], None] | None) 
             "hand, then resume",
             device="gripper",
         )
-    execution = cell.executor.run(check_path(plan_carry(grasp, cell.arm.state().q, config), config), held)
+    execution = cell.executor.run(
+        check_path(plan_carry(grasp, cell.arm.state().q, config), config), held or (lambda _: None)
+    )
     if execution.ending is not Ending.DONE:
         cell.home()
     return execution

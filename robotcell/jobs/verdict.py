@@ -43,6 +43,7 @@ class Result(str, enum.Enum):
     PUSHED = "pushed"
     NOTHING_MOVED = "nothing moved"
     REFUSED = "refused"  # the plan was unsafe; nothing moved
+    DECLINED = "declined"  # by somebody who was asked; nothing moved
     STOPPED = "stopped"  # a device, the safety layer or an operator stopped the cell
     UNKNOWN = "unknown"  # the job was cut off meanwhile
 
@@ -132,8 +133,9 @@ def _judge_grasp(
     if execution.ending is Ending.CONTACT:
         return Result.COLLIDED, None, f"{execution.peak_force_n:.0f} N during {execution.step!r}"
     if execution.ending is Ending.EMPTY:
-        result = Result.MISSED if execution.step == HELD_AFTER_LIFT else Result.LOST
-        return result, None, f"the fingers were {width} apart at {execution.step!r}"
+        if execution.step == HELD_AFTER_LIFT:
+            return Result.MISSED, None, f"the fingers were {width} apart at {execution.step!r}"
+        return Result.LOST, None, f"lost on the way: the fingers were {width} apart at {execution.step!r}"
     result, picked, detail = _judge_taken(_taken(grasp, before, after), goal)
     return result, picked, f"{detail}, held {width} wide" if result is Result.PICKED else detail
 

@@ -5,24 +5,28 @@ It adds to the safety settings of the controller and never replaces them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from robotcell.config.fingers import gripper_range, with_tips
 from robotcell.config.surroundings import obstacles
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import bodies, rg2, ur5e
+from robotcell.geometry.rounded_path import round_corners
 from robotcell.geometry.transforms import Array, check_transform, interpolate_transforms, rotation_angle
 from robotcell.motion.clearance import Tool, check_clearance
-from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan, Shape, blended
 from robotcell.motion.tool import flange_pose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from robotcell.config import CellConfig, KeepOut
+    from robotcell.interfaces import GripperRange
     from robotcell.motion.plan import Step
     from robotcell.perception.clearance_map import ClearanceMap
 
@@ -30,6 +34,8 @@ if TYPE_CHECKING:
 _JOINT_STEP_RAD = 0.04
 _LINEAR_STEP_M = 0.01
 _ROTATION_STEP_RAD = 0.05
+# On a rounded corner, which is short: the radius is a few centimetres.
+_CORNER_SAMPLES = 9
 # Two neighbouring samples of a straight path whose joints differ by more lie across a singularity.
 _MAX_JOINT_JUMP_RAD = 0.35
 # Rounding of positions that lie on a limit.
@@ -44,8 +50,8 @@ class CheckedPlan:
 
     Attributes:
         plan: as it was checked.
-        joint_paths: for each step the joint angles (N, 6) [rad] along it, from its start to its end; (1, 6) for a step
-            during which the arm stands.
+        joint_paths: for each step the joint angles (N, 6) [rad] along it, from its start to its end, or from the middle
+            of a rounded corner to the middle of the next one; (1, 6) for a step that moves no joint.
         lowest_tip_m: height above the table that the finger tips may go down to [m].
     """
 
@@ -78,21 +84,28 @@ def check_path(
     lowest = config.gripper.tip_clearance_m if lowest_tip_m is None else lowest_tip_m
     q = _joint_vector(plan.q_start, f"{plan.label}: start")
     paths: list[Array] = []
-    for step, tool in zip(plan.steps, tools(plan), strict=True):
-        path = check_step(q, step, tool, config, seen, f"{plan.label}, step {step.label!r}", lowest)
-        paths.append(path)
-        q = path[-1]
+    with_tools = tools(plan)
+    for group in blended(plan.steps):
+        legs: dict[int, Array] = {}
+        for i in group:
+            legs[i] = _leg(q, plan.steps[i], config, f"{plan.label}, step {plan.steps[i].label!r}")
+            q = legs[i][-1]
+        for i, path in _rounded(legs, plan).items():
+            name = f"{plan.label}, step {plan.steps[i].label!r}"
+            # An arm that does not round a corner comes to the corner itself.
+            _check_driven(path, legs[i][-1:], plan.steps[i], with_tools[i], config, seen, name, lowest)
+            paths.append(path)
     return CheckedPlan(plan, tuple(paths), lowest)
 
 
 def check_step(
     q: Array, step: Step, tool: Tool, config: CellConfig, seen: ClearanceMap | None, name: str, lowest_tip_m: float
 ) -> Array:
-    """Joint angles (N, 6) [rad] along one step from q (6,), checked as `check_path` does.
+    """Joint angles (N, 6) [rad] along one step from q (6,) to its target, checked as `check_path` does.
 
     Args:
         q: where it starts.
-        step: to be checked.
+        step: to be checked; its corners are not rounded.
         tool: on the flange meanwhile.
         config: of the cell.
         seen: what may stand on the table; None if nobody looked.
@@ -102,35 +115,83 @@ def check_step(
     Raises:
         UnsafeMotion: as `check_path`.
     """
-    if isinstance(step, Grip):
-        _check_grip(step, name)
+    path = _leg(q, step, config, name)
+    _check_driven(path, path[-1:], step, tool, config, seen, name, lowest_tip_m)
+    return path
+
+
+def _leg(q: Array, step: Step, config: CellConfig, name: str) -> Array:
+    """Joint angles (N, 6) along one step from q (6,); (1, 6) where the arm stands. Speeds and ranges are checked."""
+    if isinstance(step, Grip | Shape):
+        _check_grip(step, gripper_range(config), name)
         return q[None]
     if isinstance(step, CheckHold):
         return q[None]
     if isinstance(step, JointMove):
-        path = joint_path(q, step, config, name)
-    elif isinstance(step, LinearMove):
-        path = linear_path(q, step, config, name)
-    else:
-        raise TypeError(f"{name}: {type(step).__name__} is no step of a plan")
-    check_poses(path[1:], step.load_m, obstacles(config), config, name, lowest_tip_m)
+        return joint_path(q, step, config, name)
+    if isinstance(step, LinearMove):
+        return linear_path(q, step, config, name)
+    raise TypeError(f"{name}: {type(step).__name__} is no step of a plan")
+
+
+def _check_driven(
+    path: Array,
+    end: Array,
+    step: Step,
+    tool: Tool,
+    config: CellConfig,
+    seen: ClearanceMap | None,
+    name: str,
+    lowest_tip_m: float,
+) -> None:
+    """Check the path (N, 6) of a motion and its target (1, 6), where it has one."""
+    if not isinstance(step, JointMove | LinearMove):
+        return
+    poses = np.concatenate([path[1:], end])
+    check_poses(poses, step.load_m, obstacles(config), config, name, lowest_tip_m)
     if seen is not None:
         check_clearance(path, tool, seen, config, name)
-    return path
+        check_clearance(np.concatenate([path[-1:], end]), tool, seen, config, name)
+
+
+def _rounded(legs: dict[int, Array], plan: MotionPlan) -> dict[int, Array]:
+    """The path of each step of a blended group with its corners rounded, of the legs between their targets."""
+    moves = {i: step for i in legs if isinstance(step := plan.steps[i], JointMove | LinearMove)}
+    if len(moves) < 2:
+        return legs
+    blends = [move.blend_m for move in moves.values()]
+    path = round_corners([legs[i] for i in moves], blends, rg2.T_FLANGE_TCP, _CORNER_SAMPLES)
+    driven = {i: path.q[path.leg == number] for number, i in enumerate(moves)}
+    result: dict[int, Array] = {}
+    for i in legs:
+        # A check in a corner is made in its middle.
+        result[i] = driven[i] if i in driven else result[i - 1][-1:]
+    return result
 
 
 def tools(plan: MotionPlan) -> list[Tool]:
     """What hangs on the flange during each step of a plan.
 
-    Fingers that closed on a load are taken to be as wide as they were before; at the start they may be wide open.
+    Fingers that closed on a load are taken to be as wide as they were before; at the start they may be wide open. Those
+    that move beside a motion may be as wide as before or as they will be.
     """
     result: list[Tool] = []
     opening = held = rg2.MAX_WIDTH_M
+    shaped = math.nan
     for step in plan.steps:
+        if not math.isnan(shaped) and (
+            isinstance(step, Grip | CheckHold) or (isinstance(step, LinearMove) and step.contact_force_n is not None)
+        ):
+            # The fingers are waited for.
+            opening, shaped = shaped, math.nan
         if isinstance(step, Grip):
             result.append(Tool(max(opening, min(step.width_m, rg2.MAX_WIDTH_M))))
             held = max(opening, step.width_m)
             opening = step.width_m
+        elif isinstance(step, Shape):
+            opening = held = max(opening, step.width_m)
+            shaped = step.width_m
+            result.append(Tool(min(opening, rg2.MAX_WIDTH_M)))
         elif isinstance(step, JointMove):
             result.append(Tool(held if step.load_m > 0 else opening, step.load_m))
         elif isinstance(step, LinearMove):
@@ -156,11 +217,17 @@ def outside_box(points: Array, config: CellConfig, slack_m: float, lowest_m: flo
     return np.asarray(((relative < low - slack_m) | (relative > high + slack_m)).any(axis=1))
 
 
-def _check_grip(step: Grip, name: str) -> None:
-    if not rg2.MIN_WIDTH_M <= step.width_m <= rg2.MAX_WIDTH_M:
-        raise UnsafeMotion(f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's 0 to 110 mm")
-    if not rg2.MIN_FORCE_N <= step.force_n <= rg2.MAX_FORCE_N:
-        raise UnsafeMotion(f"{name}: force {step.force_n:.1f} N is outside the gripper's 3 to 40 N")
+def _check_grip(step: Grip | Shape, reach: GripperRange, name: str) -> None:
+    if not reach.min_width_m - _ROUNDING_M <= step.width_m <= reach.max_width_m + _ROUNDING_M:
+        raise UnsafeMotion(
+            f"{name}: width {1000 * step.width_m:.1f} mm is outside the gripper's {1000 * reach.min_width_m:.0f} to "
+            f"{1000 * reach.max_width_m:.0f} mm{with_tips(reach)}"
+        )
+    if not reach.min_force_n <= step.force_n <= reach.max_force_n:
+        raise UnsafeMotion(
+            f"{name}: force {step.force_n:.1f} N is outside the gripper's {reach.min_force_n:.0f} to "
+            f"{reach.max_force_n:.0f} N"
+        )
 
 
 def _joint_vector(q: Array, name: str) -> Array:

@@ -6,9 +6,19 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from robotcell.config.fingers import closed_width
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
-from robotcell.motion.plan import Grip, MotionPlan, Step, guarded_move, home_move, joint_move, linear_move
+from robotcell.motion.plan import (
+    MotionPlan,
+    Shape,
+    Step,
+    blend_radius,
+    guarded_move,
+    home_move,
+    joint_move,
+    linear_move,
+)
 from robotcell.motion.rotations import rotation_angle_rad
 from robotcell.motion.tool import near_height, solve_tool_down, tool_down, touch_height
 
@@ -111,22 +121,22 @@ def plan_push(
     touch_m = touch_height(push.top_m)
     top_z = approach_z
     if q_above is None:
-        q_above = solve_tool_down("approach", above_push(push, config), config)
+        q_above = solve_tool_down("approach", above_push(push, config), config, q_start)
     else:
         top_z = float((ur5e.forward(q_above) @ rg2.T_FLANGE_TCP)[2, 3])
     T_above = ur5e.forward(q_above) @ rg2.T_FLANGE_TCP
     T_near, T_start, T_end, T_up = (T_above.copy() for _ in range(4))
-    T_near[2, 3] = near_height(heightmap, x, y, push.theta, rg2.MIN_WIDTH_M, tcp_z, config)
+    T_near[2, 3] = near_height(heightmap, x, y, push.theta, closed_width(config), tcp_z, config)
     T_start[2, 3] = tcp_z
     T_end[:3, 3] = (end_x, end_y, tcp_z)
     T_up[:3, 3] = (end_x, end_y, top_z)
     steps: tuple[Step, ...] = (
-        Grip("close", rg2.MIN_WIDTH_M, config.gripper.force_n),
-        joint_move("approach", q_above, config),
+        Shape("close", closed_width(config), config.gripper.force_n),
+        joint_move("approach", q_above, config, blend_m=blend_radius(top_z - T_near[2, 3])),
         linear_move("descend", T_near, config, touch_m=touch_m),
         guarded_move("descend guarded", T_start, config, touch_m),
         guarded_move("push", T_end, config, touch_m),
-        linear_move("lift", T_up, config, touch_m=touch_m),
+        linear_move("lift", T_up, config, touch_m=touch_m, blend_m=blend_radius(top_z - tcp_z)),
         home_move(config),
     )
     return MotionPlan("push", q_start, steps)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import closed_width
 from robotcell.errors import UnsafeMotion
-from robotcell.geometry import rg2
 from robotcell.motion.clearance import Obstructed
 from robotcell.motion.grasp import GRASP_DEPTH_M, LOAD_REACH_M, carry_height
 from robotcell.motion.path_check import check_path
@@ -100,7 +100,7 @@ def plan_recovery(state: ArmState, config: CellConfig) -> MotionPlan:
 
 def plan_feel(state: ArmState, config: CellConfig) -> MotionPlan:
     """Straight up, and close the fingers there: what they then are apart is what they hold."""
-    feel = Grip("feel what is held", rg2.MIN_WIDTH_M, config.gripper.force_n)
+    feel = Grip("feel what is held", closed_width(config), config.gripper.force_n)
     return MotionPlan("feel what is held", state.q, (*_rise(state, config), feel))
 
 

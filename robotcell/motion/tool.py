@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import gripper_range
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import Array, invert_transform, make_transform
@@ -38,13 +39,16 @@ def flange_pose(T_base_tcp: Array) -> Array:
     return T_base_tcp @ invert_transform(rg2.T_FLANGE_TCP)
 
 
-def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
-    """Joint angles (6,) [rad] nearest to the home pose; the jaw is symmetric, so half a turn about its axis is as good.
+def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig, q_from: Array | None = None) -> Array:
+    """Joint angles (6,) [rad] in the posture of the home pose.
+
+    The jaw is symmetric, so half a turn about its axis is as good.
 
     Args:
         label: of the step, for the error.
         T_base_tcp: pose (4, 4) of a tool that points down.
         config: of the cell.
+        q_from: joint angles (6,) from which the leading joint is to have the shortest way; the home pose unless given.
 
     Raises:
         UnsafeMotion: the arm cannot reach the pose.
@@ -55,7 +59,8 @@ def solve_tool_down(label: str, T_base_tcp: Array, config: CellConfig) -> Array:
     if not solutions:
         x, y, z = T_base_tcp[:3, 3]
         raise UnsafeMotion(f"{label}: the arm cannot reach x {x:.3f}, y {y:.3f}, z {z:.3f} m with the tool down")
-    return min(solutions, key=lambda q: float(np.abs(q - home).max()))
+    near = home if q_from is None else q_from
+    return min(solutions, key=lambda q: float(np.abs(q - near).max()))
 
 
 def tool_down_solutions(T_base_tcp: Array, config: CellConfig) -> list[Array]:
@@ -88,19 +93,21 @@ def near_height(
         tcp_z: z of the tcp at the end of the descent [m].
         config: of the cell.
     """
-    highest = config.table.height_m + _clear_above(heightmap, x, y, theta, opening_m)
-    near = highest + _NEAR_M - rg2.tip_retraction(opening_m)
+    offset_m = gripper_range(config).fingertip_offset_m
+    thickness = rg2.finger_thickness(offset_m)
+    highest = config.table.height_m + _clear_above(heightmap, x, y, theta, opening_m, thickness)
+    near = highest + _NEAR_M - rg2.tip_retraction(opening_m, offset_m)
     return float(np.clip(near, tcp_z, tcp_z + config.motion.approach_m))
 
 
-def _clear_above(heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float) -> float:
+def _clear_above(heightmap: Heightmap, x: float, y: float, theta: float, opening_m: float, thickness_m: float) -> float:
     """Height [m above the table] above which nothing is expected under the gripper, turned by theta and so far open.
 
     The highest cell that was seen there; where a cell is unknown, or lies outside the map, at least the tallest
     object. Gaps between pixels are closed first.
     """
     workspace = heightmap.workspace
-    half_x = opening_m / 2 + rg2.FINGER_THICKNESS_M + _AROUND_M
+    half_x = opening_m / 2 + thickness_m + _AROUND_M
     half_y = rg2.FINGER_BREADTH_M / 2 + _AROUND_M
     steps = [np.arange(-half, half + workspace.resolution_m, workspace.resolution_m) for half in (half_x, half_y)]
     u, v = np.meshgrid(*steps)

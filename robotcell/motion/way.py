@@ -10,6 +10,7 @@ deterministic: the same view gives the same plan.
 from __future__ import annotations
 
 import heapq
+from contextlib import suppress
 from functools import lru_cache
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -23,7 +24,7 @@ from robotcell.geometry.transforms import make_transform, rotation_z
 from robotcell.motion.actions import above, plan_action
 from robotcell.motion.clearance import Obstructed, standing_clear
 from robotcell.motion.path_check import CheckedPlan, allowed_poses, check_path, check_step, tools
-from robotcell.motion.plan import JointMove, MotionPlan
+from robotcell.motion.plan import JointMove, MotionPlan, without_blends
 from robotcell.motion.tool import flange_pose, tool_down_solutions
 
 if TYPE_CHECKING:
@@ -77,15 +78,18 @@ def plan_way(
         return check_path(plan, config, seen)
     except Obstructed as error:
         usual = error
+    with suppress(UnsafeMotion):
+        # What stands beside a corner may be in the way of its rounding alone.
+        return check_path(without_blends(plan), config, seen)
     searches = 0
-    home, tool = plan.steps[-1], tools(plan)[-1]
-    # Every plan ends in the home pose: where the arm may not stand there, none is looked for.
-    at_home = isinstance(home, JointMove) and bool(standing_clear(home.q[None], tool, seen, config).all())
-    for q_above in tool_down_solutions(above(action, config), config) if at_home else ():
+    last, tool = [pair for pair in zip(plan.steps, tools(plan), strict=True) if isinstance(pair[0], JointMove)][-1]
+    # Every plan ends at home or over the bin: where the arm may not stand there, none is looked for.
+    can_end = isinstance(last, JointMove) and bool(standing_clear(last.q[None], tool, seen, config).all())
+    for q_above in tool_down_solutions(above(action, config), config) if can_end else ():
         plans = []
         for q_high in (q_above, *_poses_above(q_above, config)):
             try:
-                plan = plan_action(action, heightmap, q_start, config, q_high)
+                plan = without_blends(plan_action(action, heightmap, q_start, config, q_high))
                 check_straight(plan, seen, config)
             except UnsafeMotion:
                 # From higher up the arm comes down to the same pose.

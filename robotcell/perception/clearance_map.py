@@ -202,8 +202,8 @@ def build_clearance_map(
         camera: that took it, as its calibration has it.
         table_height_m: z of the table in the base frame.
         furniture: boxes that stand on the table and are known: there columns are followed up from their tops.
-        own: (Himg, Wimg) pixels that show the arm or what it holds, through which the camera does not look; None where
-            the arm stands out of the view.
+        own: (Himg, Wimg) pixels that may show the arm or what it holds: what they hide was not looked at. None where
+            the arm is in no picture.
 
     Raises:
         CalibrationError: the frame is of another resolution than the calibration.
@@ -227,19 +227,19 @@ def build_clearance_map(
     ceiling = np.zeros(len(places), np.float32)
     open_top, left_hidden = np.zeros(len(places), np.bool_), np.zeros(len(places), np.bool_)
     first = look(np.arange(len(places)))
-    looked_at = first.within
+    looked_at = first.within & ~first.veiled
     ceiling[~looked_at & (np.hypot(*places.T) > _BASE_M)] = TALLEST_BLOCK_M
     # Whether a column was last followed through a surface, rather than through the shadow of something.
     surface = first.surface.copy()
     camera_m = float(camera.position[2]) - table_height_m
-    hidden = np.flatnonzero(first.within & ~first.passed)
+    hidden = np.flatnonzero(looked_at & ~first.passed)
     while hidden.size:
         height[hidden] += _STEP_M
         looks = look(hidden)
-        out = ~looks.within | (height[hidden] >= camera_m)
+        out = ~looks.within | looks.veiled | (height[hidden] >= camera_m)
         open_top[hidden[out & surface[hidden]]] = True
         left_hidden[hidden[out]] = True
-        ceiling[hidden] = height[hidden]
+        ceiling[hidden] = np.where(looks.veiled, np.maximum(height[hidden], TALLEST_BLOCK_M), height[hidden])
         surface[hidden[~out]] = looks.surface[~out]
         hidden = hidden[~out & ~looks.passed]
     top = open_top.reshape(shape)
@@ -252,11 +252,15 @@ def build_clearance_map(
 
 
 class _Looks(NamedTuple):
-    """What the camera sees at points: whether it looks there, sees past them, or sees a surface there; all (N,)."""
+    """What the camera sees at points, all (N,): are they in its picture, does it see past them, or a surface there?
+
+    `veiled` are those in its picture that the arm may hide.
+    """
 
     within: npt.NDArray[np.bool_]
     passed: npt.NDArray[np.bool_]
     surface: npt.NDArray[np.bool_]
+    veiled: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,12 +269,14 @@ class _Sight:
 
     Attributes:
         nearest_m: (H, W) the nearest return around each pixel [m]; infinite where there is none.
-        valid: (H, W) pixels through which the camera looks at the cell.
+        valid: (H, W) pixels through which the camera looks.
+        own: (H, W) those that may show the arm or what it holds.
         frame, camera: that took it.
     """
 
     nearest_m: npt.NDArray[np.float32]
     valid: npt.NDArray[np.bool_]
+    own: npt.NDArray[np.bool_]
     frame: RgbdFrame
     camera: CalibratedCamera
 
@@ -284,9 +290,11 @@ class _Sight:
         pixel = row[within].astype(np.intp), col[within].astype(np.intp)
         seen = np.full(len(points), np.inf)
         seen[within] = self.nearest_m[pixel]
-        within[within] = self.valid[pixel]
         passed = np.isfinite(seen) & (seen > depth + _PAST_M)
-        return _Looks(within, passed, np.abs(seen - depth) < _BEFORE_M)
+        veiled = np.zeros(len(points), np.bool_)
+        veiled[within] = self.own[pixel]
+        within[within] = self.valid[pixel]
+        return _Looks(within, passed, np.abs(seen - depth) < _BEFORE_M, within & veiled & ~passed)
 
 
 def _sight(frame: RgbdFrame, camera: CalibratedCamera, own: npt.NDArray[np.bool_] | None) -> _Sight:
@@ -297,9 +305,8 @@ def _sight(frame: RgbdFrame, camera: CalibratedCamera, own: npt.NDArray[np.bool_
     valid = np.zeros(depth.shape, np.bool_)
     first, last = _valid_columns(depth)
     valid[:, first:last] = True
-    if own is not None:
-        valid &= ~own
-    return _Sight(np.asarray(nearest, np.float32), valid, frame, camera)
+    own = np.zeros(depth.shape, np.bool_) if own is None else own
+    return _Sight(np.asarray(nearest, np.float32), valid, own, frame, camera)
 
 
 def _valid_columns(depth: npt.NDArray[np.float32]) -> tuple[int, int]:

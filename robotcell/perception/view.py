@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotcell.config.surroundings import bin_box
-from robotcell.errors import CalibrationError, DeviceFault
+from robotcell.errors import CalibrationError, CellError, DeviceFault
 from robotcell.geometry.bodies import blocks_view
+from robotcell.perception.arm_mask import arm_mask
 from robotcell.perception.calibrated_camera import CalibratedCamera
 from robotcell.perception.clearance_map import ClearanceMap, build_clearance_map
 from robotcell.perception.heightmap import Heightmap, build_heightmap
@@ -17,7 +18,10 @@ from robotcell.perception.segmentation import Segmentation, segment
 from robotcell.perception.tags import check_tags
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from robotcell.config import CellConfig, Workspace
+    from robotcell.geometry.transforms import Array
     from robotcell.interfaces import Devices, RgbdFrame
 
 
@@ -50,42 +54,106 @@ def look(devices: Devices, config: CellConfig, workspace: Workspace | None = Non
 
     Raises:
         ConnectionLost, DeviceFault: the camera delivers nothing, or a stale or sparse frame.
-        CalibrationError: the table is not where the configuration has it, a fixed tag not where it was, or the
-            calibration is of another resolution.
+        CalibrationError: as `see`.
     """
-    limits, workspace = config.limits, workspace or config.workspace
-    camera = CalibratedCamera.of(config.camera)
-    if blocks_view(devices.arm.state().q, camera.position, workspace.x, workspace.y, config.table.height_m):
+    if view_blocked(devices, config, workspace):
         raise DeviceFault(
             "the arm stands between the camera and the workspace: move it to the home pose, then look", device="arm"
         )
+    return see(fresh_frame(devices, config), config, devices.arm.state().q, workspace)
+
+
+def view_blocked(devices: Devices, config: CellConfig, workspace: Workspace | None = None, load_m: float = 0.0) -> bool:
+    """Whether the arm, or a load that reaches so far [m] from the tcp, stands between the camera and the workspace.
+
+    Raises:
+        ConnectionLost: the arm cannot be asked.
+    """
+    workspace, eye = workspace or config.workspace, CalibratedCamera.of(config.camera).position
+    q, table = devices.arm.state().q, config.table.height_m
+    return blocks_view(q, eye, workspace.x, workspace.y, table, load_m)
+
+
+def fresh_frame(devices: Devices, config: CellConfig) -> RgbdFrame:
+    """A frame of the camera.
+
+    Raises:
+        ConnectionLost, DeviceFault: there is none, or it is older than `limits.frame_age_s`.
+    """
     frame = devices.camera.read()
-    age = devices.clock.now() - frame.t
-    if age > limits.frame_age_s:
+    check_age(frame, devices.clock.now(), config)
+    return frame
+
+
+def check_age(frame: RgbdFrame, now: float, config: CellConfig) -> None:
+    """Raise DeviceFault for a frame that is too old at `now` [s] on the cell's clock."""
+    age = now - frame.t
+    if age > config.limits.frame_age_s:
         raise DeviceFault(
-            f"frame {frame.number} is {age:.2f} s old (limit {limits.frame_age_s} s): check the camera", device="camera"
+            f"frame {frame.number} is {age:.2f} s old (limit {config.limits.frame_age_s} s): check the camera",
+            device="camera",
         )
-    if config.camera.measured is not None:
-        check_tags(frame.color, config.camera.measured.tags)
-    view = view_of(frame, config, workspace)
-    _check_coverage(view.heightmap, limits.min_coverage)
-    _check_table(view.heightmap, config)
+
+
+def see(frame: RgbdFrame, config: CellConfig, q: Array, workspace: Workspace | None = None) -> View:
+    """What a frame shows of the table, if it is fit to act on. Touches no device, and depends on nothing else.
+
+    Args:
+        frame: with the workspace in free view.
+        config: of the cell.
+        q: joint angles (6,) [rad] at which it was taken.
+        workspace: the map to build: rectangle and resolution; that of the cell unless given.
+
+    Raises:
+        DeviceFault: too little of the workspace is seen.
+        CalibrationError: the table is not where the configuration has it, a fixed tag not where it was, or the
+            calibration is of another resolution.
+    """
+    view, problems = examine(frame, config, q, workspace or config.workspace)
+    if problems:
+        raise problems[0]
     return view
 
 
-def view_of(frame: RgbdFrame, config: CellConfig, workspace: Workspace) -> View:
-    """What a frame shows, of now or of a recorded look, on the map of a workspace; nothing is checked."""
+def examine(frame: RgbdFrame, config: CellConfig, q: Array, workspace: Workspace) -> tuple[View, list[CellError]]:
+    """What a frame shows, and everything that makes it unfit to act on; the arguments are those of `see`.
+
+    Raises:
+        CalibrationError: the calibration is of another resolution.
+    """
+    view, problems = view_of(frame, config, workspace, q), list[CellError]()
+    try:
+        if config.camera.measured is not None:
+            check_tags(frame.color, config.camera.measured.tags)
+    except CalibrationError as error:
+        problems.append(error)
+    problems += _coverage_problems(view.heightmap, config.limits.min_coverage)
+    problems += _table_problems(view.heightmap, config)
+    return view, problems
+
+
+def view_of(frame: RgbdFrame, config: CellConfig, workspace: Workspace, q: Array | None = None) -> View:
+    """What a frame shows, of now or of a recorded look, on the map of a workspace; nothing is checked.
+
+    Args:
+        frame: with the workspace in free view.
+        config: of the cell.
+        workspace: the map to build.
+        q: joint angles (6,) [rad] at which it was taken; None for an arm that is in no picture.
+    """
     camera = CalibratedCamera.of(config.camera)
-    heightmap = build_heightmap(frame, camera, workspace, config.table.height_m)
-    clearance = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),))
+    arm = None if q is None else arm_mask(q, camera, frame.intrinsics)
+    without_arm = frame if arm is None else replace(frame, depth_m=np.where(arm, np.float32(0), frame.depth_m))
+    heightmap = build_heightmap(without_arm, camera, workspace, config.table.height_m)
+    clearance = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),), arm)
     return View(frame, camera, heightmap, segment(heightmap), clearance)
 
 
-def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:
+def _coverage_problems(heightmap: Heightmap, min_coverage: float) -> Iterator[CellError]:
     # Without the gaps between pixels, which say something of the resolution and nothing of the view.
     coverage = float(np.isfinite(heightmap.closed_m).mean())
     if coverage < min_coverage:
-        raise DeviceFault(
+        yield DeviceFault(
             f"the camera sees {coverage:.0%} of the workspace (limit {min_coverage:.0%}): check its view, its "
             f"lens and the light; cells finer than its pixels (here {1000 * heightmap.workspace.resolution_m:g} mm) "
             "stay empty too",
@@ -93,12 +161,12 @@ def _check_coverage(heightmap: Heightmap, min_coverage: float) -> None:
         )
 
 
-def _check_table(heightmap: Heightmap, config: CellConfig) -> None:
+def _table_problems(heightmap: Heightmap, config: CellConfig) -> Iterator[CellError]:
     table, limits = heightmap.table, config.limits
     if table is None:
-        raise CalibrationError("too little of the table is seen to tell where it is: clear a part of the workspace")
-    if table.tilt_rad > limits.max_tilt_rad or abs(table.offset_m) > limits.max_table_offset_m:
-        raise CalibrationError(
+        yield CalibrationError("too little of the table is seen to tell where it is: clear a part of the workspace")
+    elif table.tilt_rad > limits.max_tilt_rad or abs(table.offset_m) > limits.max_table_offset_m:
+        yield CalibrationError(
             f"the table appears tilted by {np.degrees(table.tilt_rad):.2f} degrees and {1000 * table.offset_m:+.1f} mm "
             f"off (limits {np.degrees(limits.max_tilt_rad):.2f} degrees, {1000 * limits.max_table_offset_m:.1f} mm): "
             "check table.height_m and the camera's pose, calibrate again if it was moved"

@@ -1,4 +1,4 @@
-"""The twin's UR5e: position-controlled joints of limited torque that follow trapezoidal profiles.
+"""The twin's UR5e: position-controlled joints of limited torque that follow jerk-limited profiles.
 
 It refuses what the controller refuses, and stops by itself where the controller does: on a contact force, on a joint
 that cannot follow, on a line that its kinematics cannot follow, and when nobody supervises the motion.
@@ -13,28 +13,27 @@ import numpy as np
 
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import controller_ranges, rg2, ur5e
-from robotcell.geometry.transforms import interpolate_transforms, invert_transform, rotation_angle
-from robotcell.interfaces import KICK_TIMEOUT_S, Arm, ArmMode, ArmState
+from robotcell.interfaces import KICK_TIMEOUT_S, Arm, ArmMode, ArmState, JointWaypoint, LinearWaypoint
 from sim_twin.devices.arm_limits import (
     LEAVING_FORCE_N,
-    MAX_TARGET_SPEED_RAD_S,
     PROTECTIVE_FORCE_N,
-    ROTATION_LEVER_M,
     STOP_DECELERATION_RAD_S2,
     TRACKING_ERROR_RAD,
 )
-from sim_twin.devices.trajectory import slow_down, trapezoid
+from sim_twin.devices.motion import plan_motion
+from sim_twin.devices.trajectory import slow_down
 from sim_twin.world import robot_model
 from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
-    from robotcell.interfaces import Array
+    from collections.abc import Sequence
+
+    from robotcell.findings import Finding
+    from robotcell.interfaces import Array, Waypoint
     from sim_twin.world.world import World
 
 # Share of the position error that each joint controller corrects within a step.
 JOINT_GAINS = (0.5,) * 6
-
-_T_TCP_FLANGE = invert_transform(rg2.T_FLANGE_TCP)
 
 
 class TwinArm(Arm):
@@ -101,6 +100,11 @@ class TwinArm(Arm):
             mode=self._mode,
         )
 
+    def report(self) -> tuple[Finding, ...]:
+        """Nothing: it has no settings of its own that could differ from the cell's."""
+        self._need_connection()
+        return ()
+
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint-space motion; see `Arm`.
 
@@ -109,13 +113,7 @@ class TwinArm(Arm):
                 the controller's range, or the arm is moving.
             DeviceFault: the arm is stopped.
         """
-        self._need_ready()
-        target = controller_ranges.check_joint_motion(q, speed_rad_s, acceleration_rad_s2)
-        start = self._path[-1]
-        distance = float(np.abs(target - start).max())
-        s = trapezoid(distance, speed_rad_s, acceleration_rad_s2, STEP_S)
-        if len(s):
-            self._start(start + (s / distance)[:, None] * (target - start))
+        self.start_path((JointWaypoint(q, speed_rad_s, acceleration_rad_s2),))
 
     def start_linear(self, T_base_tcp: Array, speed_m_s: float, acceleration_m_s2: float) -> None:
         """Start a straight motion of the tcp; see `Arm`.
@@ -128,17 +126,20 @@ class TwinArm(Arm):
                 the arm is moving.
             DeviceFault: the arm is stopped.
         """
+        self.start_path((LinearWaypoint(T_base_tcp, speed_m_s, acceleration_m_s2),))
+
+    def start_path(self, waypoints: Sequence[Waypoint]) -> None:
+        """Start a motion along several legs; see `Arm`. What `start_linear` says of lines holds for each.
+
+        Raises:
+            UnsafeMotion: a leg is outside the ranges, a blend radius too, or the arm is moving.
+            DeviceFault: the arm is stopped.
+        """
         self._need_ready()
-        T_goal = controller_ranges.check_linear_motion(T_base_tcp, speed_m_s, acceleration_m_s2)
-        q = self._path[-1]
-        T_start = ur5e.forward(q) @ rg2.T_FLANGE_TCP
-        turn = rotation_angle(T_start[:3, :3], T_goal[:3, :3])
-        distance = max(float(np.linalg.norm(T_goal[:3, 3] - T_start[:3, 3])), turn * ROTATION_LEVER_M)
-        s = trapezoid(distance, speed_m_s, acceleration_m_s2, STEP_S)
-        if not len(s):
-            return
-        path = _followed(interpolate_transforms(T_start, T_goal, s / distance) @ _T_TCP_FLANGE, q)
-        self._start(path, breaks_off=len(path) < len(s))
+        checked = controller_ranges.check_path_motion(waypoints)
+        motion = plan_motion(self._path[-1], checked, rg2.T_FLANGE_TCP, STEP_S)
+        if len(motion.q) or motion.breaks_off:
+            self._start(motion.q, breaks_off=motion.breaks_off)
 
     def stop(self) -> None:
         """Brake along the path at `STOP_DECELERATION_RAD_S2`."""
@@ -209,21 +210,12 @@ class TwinArm(Arm):
     def _need_ready(self) -> None:
         self._need_connection()
         if self._mode is not ArmMode.READY:
-            raise DeviceFault(f"the arm is in {self._mode.value}: look at the cell, clear the contact, then recover")
+            raise DeviceFault(
+                f"the arm is in {self._mode.value}: look at the cell, clear the contact, then run robotcell recover"
+            )
         if self.moving:
             raise UnsafeMotion("the arm is still moving: wait until the motion has ended, or stop it")
 
 
 def _norm(vector: Array) -> float:
     return math.sqrt(float(vector @ vector))
-
-
-def _followed(T_base_flange: Array, q_start: Array) -> Array:
-    """Joint angles (M, 6) along flange poses (N, 4, 4), one per step: as many as the arm can follow, M <= N."""
-    path = [q_start]
-    for T in T_base_flange:
-        q = ur5e.inverse(T, path[-1])
-        if q is None or float(np.abs(q - path[-1]).max()) > MAX_TARGET_SPEED_RAD_S * STEP_S:
-            break
-        path.append(q)
-    return np.array(path[1:]).reshape(-1, 6)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from robotcell.cell import Cell
-from robotcell.interfaces import Devices
+from robotcell.geometry import rg2
+from robotcell.interfaces import Devices, GripperRange
 from sim_twin.options import TwinOptions
 
 if TYPE_CHECKING:
@@ -29,6 +30,12 @@ class TwinBackend:
     @staticmethod
     def cell_name(config: CellConfig) -> None:
         """None: the world is this process's own, and a stop in it ends with it."""
+
+    @staticmethod
+    def gripper_range(config: CellConfig) -> GripperRange:
+        """What the simulated RG2 reaches with its tips."""
+        options = TwinOptions.model_validate(config.backend.options)
+        return rg2.range_with_tips(options.fingertip_offset_m)
 
 
 def open_twin(config: CellConfig, scene: Scene | None = None) -> tuple[Cell, World]:

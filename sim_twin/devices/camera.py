@@ -13,6 +13,8 @@ from sim_twin.d415.renderer import FRAMES_PER_S, SERIAL, Floats, Renderer
 from sim_twin.world.simulation import STEP_S
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.config import CameraMount
     from sim_twin.d415.rays import Indices
     from sim_twin.options import TwinOptions
@@ -87,20 +89,40 @@ class TwinCamera(Camera):
         Raises:
             ConnectionLost: the camera is not connected.
         """
-        first_frame = self._connected()
+        self._connected()
         self._world.step(_STEPS_PER_FRAME)
-        t, number = self._world.time_s, self._frame_number()
-        renderer = self._prepare()
-        hits = renderer.cast(self._world.visual_poses())
-        frame = RgbdFrame(
-            t=t,
-            number=number,
-            color=renderer.measured_color(renderer.color(hits), number, t, number - first_frame),
-            depth_m=renderer.measured_depth(hits.depth_m, renderer.incidence_cos(hits), number),
-            intrinsics=renderer.reported_intrinsics,
-            serial=SERIAL,
-        )
-        return frame, hits.visual()
+        return self._capture()()
+
+    def poll(self, since: float) -> Callable[[], RgbdFrame] | None:
+        """The frame of this moment, once one is due after `since`; see `Camera`.
+
+        Raises:
+            ConnectionLost: the camera is not connected.
+        """
+        self._connected()
+        if self._frame_number() <= round(since / STEP_S) // _STEPS_PER_FRAME:
+            return None
+        develop = self._capture()
+        return lambda: develop()[0]
+
+    def _capture(self) -> Callable[[], tuple[RgbdFrame, Indices]]:
+        """What there is to see now; called, it gives the frame, and the index (H, W) of what each pixel shows."""
+        first_frame, renderer = self._connected(), self._prepare()
+        t, number, poses = self._world.time_s, self._frame_number(), self._world.visual_poses()
+
+        def develop() -> tuple[RgbdFrame, Indices]:
+            hits = renderer.cast(poses)
+            frame = RgbdFrame(
+                t=t,
+                number=number,
+                color=renderer.measured_color(renderer.color(hits), number, t, number - first_frame),
+                depth_m=renderer.measured_depth(hits.depth_m, renderer.incidence_cos(hits), number),
+                intrinsics=renderer.reported_intrinsics,
+                serial=SERIAL,
+            )
+            return frame, hits.visual()
+
+        return develop
 
     def render_truth(self) -> tuple[Floats, Indices]:
         """What is really in front of the camera now: for scores, labels and tests, never for a decision.

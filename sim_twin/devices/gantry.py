@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotcell.config.fingers import closed_width, narrowest_hold
 from robotcell.geometry import rg2
 from robotcell.geometry.transforms import invert_transform
 from robotcell.motion.executor import Ending
@@ -82,7 +83,7 @@ class GantryGripper:
 
     def __init__(self, config: CellConfig, options: TwinOptions, scene: Scene, friction: Friction) -> None:
         self.config = config
-        self.world = World(config, options, friction, robot_model.gantry_machine(), scene)
+        self.world = World(config, options, friction, robot_model.gantry_machine(options.fingertip_offset_m), scene)
         self._gripper = TwinGripper(self.world)
         self._taken: set[int] = set()
         self._slides: list[int] = []
@@ -127,24 +128,24 @@ class GantryGripper:
         self._place(x, y, near_z, theta, use.preshape_m)
         if not self._slide(0.0, near_z - tcp_z, _GUARDED_SPEED_M_S, guarded=True):
             return Attempt(Ending.CONTACT)
-        self._gripper.start_width(rg2.MIN_WIDTH_M, use.force_n)
+        self._gripper.start_width(closed_width(self.config), use.force_n)
         for _ in range(_FINGERS_STEPS):
             self.world.step()
             if not self._gripper.state().busy:
                 break
-        if self._gripper.state().width_m < use.empty_width_m:
+        if self._gripper.state().width_m < narrowest_hold(self.config):
             return Attempt(Ending.EMPTY)
         heights = self._heights()
         self._slide(0.0, near_z - tcp_z - _LIFT_M, self.config.motion.linear_speed_m_s, guarded=False)
         self._swing(near_z - tcp_z - _LIFT_M)
         rose = self._heights() - heights
         held = tuple(int(i) for i in np.flatnonzero(rose > _HELD_SHARE * _LIFT_M))
-        lost = self._gripper.state().width_m < use.empty_width_m or not held
+        lost = self._gripper.state().width_m < narrowest_hold(self.config) or not held
         return Attempt(Ending.DONE, () if lost else held)
 
     def push(self, start: tuple[float, float], theta: float, length_m: float, near_z: float, tcp_z: float) -> Attempt:
         """Come down at start (x, y) with closed fingers and move by `length_m` along theta; arguments as in `grasp`."""
-        self._place(*start, near_z, theta, rg2.MIN_WIDTH_M)
+        self._place(*start, near_z, theta, closed_width(self.config))
         if not self._slide(0.0, near_z - tcp_z, _GUARDED_SPEED_M_S, guarded=True):
             return Attempt(Ending.CONTACT)
         self._slide(length_m, near_z - tcp_z, _GUARDED_SPEED_M_S, guarded=True)
@@ -199,7 +200,7 @@ class GantryGripper:
         T_base_flange = tool_down(x, y, z, theta) @ _T_TCP_FLANGE
         position = T_base_flange[:3, 3].tolist()
         p.resetBasePositionAndOrientation(simulation.robot, position, quaternion(T_base_flange), physicsClientId=client)
-        angles = robot_model.finger_angles(rg2.crank_angle(width_m))
+        angles = robot_model.finger_angles(rg2.crank_angle(width_m + 2 * self.world.gripper_range.fingertip_offset_m))
         for joint, name in self._fingers.items():
             p.resetJointState(simulation.robot, joint, angles[name], physicsClientId=client)
         for joint in self._slides:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from robotcell.errors import ConnectionLost, UnsafeMotion
 from robotcell.geometry import rg2
-from robotcell.interfaces import Gripper, GripperState
+from robotcell.interfaces import Gripper, GripperRange, GripperState
 from sim_twin.world import robot_model
 from sim_twin.world.simulation import STEP_S
 
@@ -38,6 +38,7 @@ class TwinGripper(Gripper):
     def __init__(self, world: World) -> None:
         self._world = world
         self._connected = False
+        self._range = world.gripper_range
         self._cranks: list[int] = []
         self._target_m = 0.0
         self._force_n = 0.0
@@ -72,13 +73,18 @@ class TwinGripper(Gripper):
     def state(self) -> GripperState:
         """The state after the last step."""
         self._need_connection()
-        width = _width(self._world.joint_states(self._cranks)[0])
+        width = self._width(self._world.joint_states(self._cranks)[0])
         return GripperState(
             t=self._world.time_s,
-            width_m=max(width, rg2.MIN_WIDTH_M),
+            width_m=max(width, self._range.min_width_m),
             busy=self._driving and not self._stopped,
             grip_detected=self._driving and self._stopped and abs(width - self._target_m) > GRIP_TOLERANCE_M,
         )
+
+    def range(self) -> GripperRange:
+        """What it reaches with its tips; see `Gripper`."""
+        self._need_connection()
+        return self._range
 
     def start_width(self, width_m: float, force_n: float) -> None:
         """Start moving the fingers; see `Gripper`.
@@ -87,8 +93,9 @@ class TwinGripper(Gripper):
             UnsafeMotion: width or force are outside the RG2's range.
         """
         self._need_connection()
-        _check_range("width", 1000 * width_m, 1000 * rg2.MIN_WIDTH_M, 1000 * rg2.MAX_WIDTH_M, "mm")
-        _check_range("force", force_n, rg2.MIN_FORCE_N, rg2.MAX_FORCE_N, "N")
+        reach = self._range
+        _check_range("width", 1000 * width_m, 1000 * reach.min_width_m, 1000 * reach.max_width_m, "mm")
+        _check_range("force", force_n, reach.min_force_n, reach.max_force_n, "N")
         if (width_m, force_n) != (self._target_m, self._force_n):
             self._target_m, self._force_n = width_m, force_n
             self._forget_motion()
@@ -98,7 +105,7 @@ class TwinGripper(Gripper):
         """Hold the fingers where they are."""
         self._need_connection()
         angles, _ = self._world.joint_states(self._cranks)
-        self._target_m = min(max(_width(angles), rg2.MIN_WIDTH_M), rg2.MAX_WIDTH_M)
+        self._target_m = min(max(self._width(angles), self._range.min_width_m), self._range.max_width_m)
         self._force_n = 0.0
         self._hold()
 
@@ -110,7 +117,7 @@ class TwinGripper(Gripper):
         if not self._driving:
             return
         angles, _ = self._world.joint_states(self._cranks)
-        width, angle = _width(angles), float(angles.mean())
+        width, angle = self._width(angles), float(angles.mean())
         way = self._target_m - width
         if abs(way) < _REACHED_M:
             self._hold()
@@ -135,24 +142,25 @@ class TwinGripper(Gripper):
 
     def _forget_motion(self) -> None:
         self._judged_steps = 0
-        self._judged_width_m = _width(self._world.joint_states(self._cranks)[0])
+        self._judged_width_m = self._width(self._world.joint_states(self._cranks)[0])
         self._stopped = False
 
     def _hold(self) -> None:
         self._driving = False
         self._forget_motion()
-        angle = rg2.crank_angle(self._target_m)
+        angle = rg2.crank_angle(self._target_m + 2 * self._range.fingertip_offset_m)
         self._world.drive_positions(self._cranks, (angle,) * 2, (_HOLDING_TORQUE_NM,) * 2, (0.5,) * 2)
+
+    def _width(self, angles: Array) -> float:
+        """Between the tips [m]."""
+        bare = 0.5 * sum(rg2.width_at(float(angle)) for angle in angles)
+        return bare - 2 * self._range.fingertip_offset_m
 
     def _need_connection(self) -> None:
         if not self._connected:
             raise ConnectionLost("the twin's gripper is not connected: connect it first")
 
 
-def _width(angles: Array) -> float:
-    return 0.5 * sum(rg2.width_at(float(angle)) for angle in angles)
-
-
 def _check_range(what: str, value: float, low: float, high: float, unit: str) -> None:
-    if not math.isfinite(value) or not low <= value <= high:
+    if not math.isfinite(value) or not low - 1e-9 <= value <= high + 1e-9:
         raise UnsafeMotion(f"gripper {what} {value:g} {unit} is outside the RG2's range of {low:g} to {high:g} {unit}")

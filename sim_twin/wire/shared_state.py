@@ -24,7 +24,8 @@ PERIOD_S = 0.002
 ARM_COMMAND = np.dtype(
     [("tick", "u8"), ("powered", "u1"), ("q", "f8", 6), ("T_flange_tcp", "f8", (4, 4)), ("payload_kg", "f8")]
 )
-# Written by the Compute Box, read by the world. A command is new when `count` has grown.
+# Written by the Compute Box, read by the world: the width between the bare fingers, as in `CELL_STATE`. A command is
+# new when `count` has grown.
 GRIPPER_COMMAND = np.dtype([("count", "u8"), ("stop", "u1"), ("width_m", "f8"), ("force_n", "f8")])
 # Written by the world once per physics step. `t` is simulated time [s], `wall` time.monotonic() [s] of the step.
 # `wrench`: (6,) [N, N m] that the surroundings exert on the gripper, base axes, about the origin of the flange.

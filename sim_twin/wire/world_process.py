@@ -155,6 +155,8 @@ class _Loop:
         self._state = state
         self._poses = poses
         self._gripper_count = 0
+        # What both tips take of the opening; the Compute Box speaks of the bare fingers.
+        self._tips_m = 2 * gripper.range().fingertip_offset_m
         self._steps = 0
         self._skipped = 0
 
@@ -185,7 +187,9 @@ class _Loop:
         if command["stop"]:
             self._gripper.stop()
         else:
-            self._gripper.start_width(float(command["width_m"]), float(command["force_n"]))
+            reach = self._gripper.range()
+            width = min(max(float(command["width_m"]) - self._tips_m, reach.min_width_m), reach.max_width_m)
+            self._gripper.start_width(width, float(command["force_n"]))
 
     def report(self) -> None:
         """Write down how things stand."""
@@ -199,7 +203,7 @@ class _Loop:
             qd=qd,
             wrench=wrench,
             robot_force=contact.robot_force,
-            width_m=gripper.width_m,
+            width_m=gripper.width_m + self._tips_m,
             busy=gripper.busy,
             grip_detected=gripper.grip_detected,
             gripper_count=self._gripper_count,

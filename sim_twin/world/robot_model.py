@@ -127,9 +127,9 @@ class Machine:
     visible: bool
 
 
-def links() -> tuple[Link, ...]:
-    """Every link but the base, parents first."""
-    return (*_arm_links(), *_gripper_links())
+def links(fingertip_offset_m: float = 0.0) -> tuple[Link, ...]:
+    """Every link but the base, parents first; the finger tips reach inwards from the bare fingers by that much [m]."""
+    return (*_arm_links(), *_gripper_links(fingertip_offset_m))
 
 
 def base_parts() -> tuple[Part, ...]:
@@ -167,14 +167,14 @@ def finger_angles(crank_angle: float) -> dict[str, float]:
     }
 
 
-def arm_machine(home_q: Sequence[float]) -> Machine:
-    """The arm and its gripper, the arm's joints (6,) [rad] at home."""
-    return Machine(_arm_urdf(), dict(zip(ARM_JOINTS, home_q, strict=True)), visible=True)
+def arm_machine(home_q: Sequence[float], fingertip_offset_m: float = 0.0) -> Machine:
+    """The arm and its gripper, the arm's joints (6,) [rad] at home; see `links` for the tips."""
+    return Machine(_arm_urdf(fingertip_offset_m), dict(zip(ARM_JOINTS, home_q, strict=True)), visible=True)
 
 
-def gantry_machine() -> Machine:
+def gantry_machine(fingertip_offset_m: float = 0.0) -> Machine:
     """The gripper alone, on two slides: along x and along z of a base that stands in the axes of the flange."""
-    return Machine(_gantry_urdf(), {}, visible=False)
+    return Machine(_gantry_urdf(fingertip_offset_m), {}, visible=False)
 
 
 def part_mesh(part: Part) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
@@ -183,16 +183,16 @@ def part_mesh(part: Part) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32
     return transform_points(part.T_link_part, vertices).astype(np.float32), triangles
 
 
-def _arm_urdf() -> str:
+def _arm_urdf(fingertip_offset_m: float) -> str:
     lines = ['<?xml version="1.0"?>', '<robot name="ur5e_rg2">']
     lines += _urdf_link(BASE_LINK, 4.0, (0.0, 0.0, 0.0), base_parts())
-    for link in links():
+    for link in links(fingertip_offset_m):
         lines += _urdf_jointed(link, "continuous" if link.axis else "fixed")
     lines.append("</robot>")
     return "\n".join(lines)
 
 
-def _gantry_urdf() -> str:
+def _gantry_urdf(fingertip_offset_m: float) -> str:
     lines = ['<?xml version="1.0"?>', '<robot name="rg2_gantry">']
     lines += _urdf_link(BASE_LINK, 1.0, (0.0, 0.0, 0.0), ())
     parent = BASE_LINK
@@ -200,7 +200,7 @@ def _gantry_urdf() -> str:
         slide = Link(joint, joint, parent, np.eye(4), axis, _SLIDE_MASS_KG, (0.0, 0.0, 0.0), ())
         lines += _urdf_jointed(slide, "prismatic")
         parent = joint
-    for link in _gripper_links():
+    for link in _gripper_links(fingertip_offset_m):
         if link.name == GRIPPER_LINK:
             link = replace(link, parent=parent, T_parent_link=np.eye(4))  # noqa: PLW2901
         lines += _urdf_jointed(link, "continuous" if link.axis else "fixed")
@@ -288,7 +288,7 @@ def _wrist_3() -> tuple[Part, ...]:
     return (_tube((0, 0, 0.053), (0, 0, d), 0.0375, _GREY),)
 
 
-def _gripper_links() -> list[Link]:
+def _gripper_links(fingertip_offset_m: float) -> list[Link]:
     body_mass = RG2_MASS_KG - 2 * (_CRANK_MASS_KG + _FINGER_MASS_KG)
     body = Link(GRIPPER_LINK, "flange", "wrist_3", _dh_offset(5), None, body_mass, (0.0, 0.0, 0.065), _gripper_body())
     L = rg2.CRANK_LENGTH_M
@@ -309,7 +309,16 @@ def _gripper_links() -> list[Link]:
                 (0.0, 0.0, L / 2),
                 (_bar(L, 0.010, 0.024, _DARK),),
             ),
-            Link(finger, finger, crank, knuckle, axis, _FINGER_MASS_KG, (0.0, 0.0, _KNUCKLE_TO_TIP / 2), _finger(side)),
+            Link(
+                finger,
+                finger,
+                crank,
+                knuckle,
+                axis,
+                _FINGER_MASS_KG,
+                (0.0, 0.0, _KNUCKLE_TO_TIP / 2),
+                _finger(side, fingertip_offset_m),
+            ),
         ]
     return result
 
@@ -323,9 +332,10 @@ def _gripper_body() -> tuple[Part, ...]:
     )
 
 
-def _finger(side: int) -> tuple[Part, ...]:
+def _finger(side: int, fingertip_offset_m: float) -> tuple[Part, ...]:
     breadth, thickness = rg2.FINGER_BREADTH_M, rg2.FINGER_THICKNESS_M
-    inner, outer = side * _KNUCKLE_TO_FACE, side * (_KNUCKLE_TO_FACE + thickness)
+    inner = side * (_KNUCKLE_TO_FACE - fingertip_offset_m)
+    outer = side * (_KNUCKLE_TO_FACE + thickness)
     low, high = min(inner, outer), max(inner, outer)
     carrier = side * 0.005
     return (

@@ -42,7 +42,7 @@ def robot_surfaces(joints: dict[str, int], options: TwinOptions) -> list[Surface
     found: list[Surface] = []
     for group in _by_color(robot_model.base_parts()):
         found.append((_part_visual(group, "arm"), ("fixed", 0)))
-    for link in robot_model.links():
+    for link in robot_model.links(options.fingertip_offset_m):
         index = joints[link.joint]
         body: Kind = "gripper" if index >= joints["flange"] else "arm"
         found += [(_part_visual(group, body), ("link", index)) for group in _by_color(link.parts)]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotcell.errors import ConnectionLost
+from robotcell.geometry import rg2
 from sim_twin.world import robot_model
 from sim_twin.world.bodies import (
     Friction,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
+    from robotcell.interfaces import GripperRange
     from sim_twin.options import TwinOptions
     from sim_twin.scenes.scene import Scene, SceneObject
     from sim_twin.visual import Visual
@@ -56,7 +58,7 @@ class World:
         self.config = config
         self._options = options
         self._friction = friction or Friction()
-        self._machine = machine or robot_model.arm_machine(config.motion.home_q)
+        self._machine = machine or robot_model.arm_machine(config.motion.home_q, options.fingertip_offset_m)
         self._given_scene = scene
         self._devices: list[object] = []
         self._controllers: list[Callable[[], None]] = []
@@ -68,6 +70,11 @@ class World:
         self._quiet: list[int] = []
         self._steps = 0
         self._contact: tuple[int, Contact] = (-1, NO_CONTACT)
+
+    @property
+    def gripper_range(self) -> GripperRange:
+        """What the gripper reaches with its tips."""
+        return rg2.range_with_tips(self._options.fingertip_offset_m)
 
     @property
     def time_s(self) -> float:
@@ -217,7 +224,9 @@ class World:
             table = load_furniture(simulation, config, options.camera_pose(config.camera), self._friction)
             # The scene comes to rest before the arm is there, so an object never falls onto it.
             load_scene(simulation, scene, config, options.seed, self._friction)
-            load_machine(simulation, self._machine, 0.0 if options.board else config.gripper.preshape_m)
+            # Of the bare fingers.
+            width = 0.0 if options.board else config.gripper.preshape_m + 2 * options.fingertip_offset_m
+            load_machine(simulation, self._machine, min(max(width, rg2.MIN_WIDTH_M), rg2.MAX_WIDTH_M))
             if self._machine.visible:
                 # The shoulder turns where the foot goes through a table that is higher than the arm's base.
                 shoulder = simulation.joints[robot_model.ARM_JOINTS[0]]

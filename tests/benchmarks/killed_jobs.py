@@ -48,11 +48,11 @@ class Killed:
 
     Attributes:
         seed: of the instants.
-        killed_after_s: when it was killed, each time after it had begun or gone on [s].
+        killed_after_s: when it was killed, each time after it had begun or gone on [s]; not when it had ended by then.
         in_bin: colours of the objects that lie in the bin.
         picked: colours that the journal counts.
         results: of the job's actions.
-        completed: the job ended by itself, with everything picked.
+        completed: the job ended with everything picked.
         reason: why not.
     """
 
@@ -85,23 +85,23 @@ def kill_and_resume(seed: int, kills: int, folder: Path, address: tuple[str, int
     after = [round(instants.uniform(0.0, LATEST_KILL_S), 2) for _ in range(kills)]
     visuals = _visuals(twin)
     with ServedCell(twin, *address) as served:
-        command = ["pick", "--all", "--policy", "heuristic"]
+        command, killed = ["pick", "--all", "--policy", "heuristic"], []
         for kill_s in after:
-            if not _ended_before(_command(command, cell_file), kill_s):
-                command = ["resume"]
+            if _was_killed(_command(command, cell_file), kill_s):
+                killed.append(kill_s)
+            command = ["resume"]
         for recovered in range(RECOVERIES + 1):
             report = json.loads(_output(_command([*command, "--json"], cell_file)))
             if report["code"] not in STOPPED or recovered == RECOVERIES:
                 break
             # A stop of the twin's own, as on a machine that is too busy for real time.
             _output(_command(["recover", "--yes"], cell_file))
-            command = ["resume"]
         in_bin = _in_bin(served, twin, visuals)
     with Journal(load_config(cell_file).journal.database_url()) as journal:
-        newest = journal.jobs(limit=1)[0].id
-        picked = list(journal.metrics(newest).picked)
-        results = [row.outcome.result if row.outcome else "none" for row in journal.job(newest).actions]
-    return Killed(seed, after, sorted(in_bin), sorted(picked), results, report["completed"], report["reason"])
+        job = journal.job(1)
+        picked = list(journal.metrics(job.id).picked)
+    results = [row.outcome.result if row.outcome else "none" for row in job.actions]
+    return Killed(seed, killed, sorted(in_bin), sorted(picked), results, job.status == "complete", job.reason)
 
 
 def _cells(folder: Path, address: tuple[str, int, int]) -> tuple[CellConfig, Path]:
@@ -128,16 +128,16 @@ def _command(words: Sequence[str], cell_file: Path) -> list[str]:
     return [sys.executable, "-c", "from cli.main import main; main()", *words, "--cell", str(cell_file)]
 
 
-def _ended_before(command: list[str], kill_s: float) -> bool:
-    """Run a command and kill it so long after its job has begun; whether it never began one."""
+def _was_killed(command: list[str], kill_s: float) -> bool:
+    """Run a command and kill it so long after its job has begun or gone on; False if it ended by itself before."""
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        began = any(line.startswith("job ") for line in iter(process.stderr.readline, ""))
-        if began:
+        if any(line.startswith("job ") for line in iter(process.stderr.readline, "")):
             with suppress(subprocess.TimeoutExpired):
                 process.wait(kill_s)
+        running = process.poll() is None
         process.kill()
-        return not began
+        return running
 
 
 def _output(command: list[str]) -> str:
@@ -192,7 +192,8 @@ def main() -> None:
         sys.stdout.write(f"{'once' if job.counted_once else 'WRONG'} {asdict(job)}\n")
         sys.stdout.flush()
     once, complete = sum(job.counted_once for job in known), sum(job.completed for job in known)
-    sys.stdout.write(f"{len(known)} jobs killed: {once} count every object once, {complete} are complete\n")
+    kills = sum(len(job.killed_after_s) for job in known)
+    sys.stdout.write(f"{len(known)} jobs, {kills} kills: {once} count every object once, {complete} are complete\n")
 
 
 if __name__ == "__main__":

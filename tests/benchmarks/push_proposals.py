@@ -40,7 +40,7 @@ COUNT = (4, 13)
 
 CONFIG = load_config()
 RESOLUTION_M, PUSH_M = CONFIG.workspace.resolution_m, CONFIG.motion.push_m
-GRIPPER = OpenGripper(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
+GRIPPER = OpenGripper.of(CONFIG)
 
 
 class View(NamedTuple):

@@ -39,7 +39,7 @@ SEEN_CELLS = 60
 
 CONFIG = load_config()
 RESOLUTION_M = CONFIG.workspace.resolution_m
-GRIPPER = OpenGripper(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
+GRIPPER = OpenGripper.of(CONFIG)
 
 
 class Ranking:

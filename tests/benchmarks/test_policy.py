@@ -105,7 +105,7 @@ def test_predict(benchmark, config, heightmap, inference):
     lines = (push_line(height_m, free, cell, 0, config.motion.push_m, resolution_m) for cell in cells)
     line = next(line for line in lines if line is not None)
     model = PushForwardModel(observation.labels, heightmap)
-    gripper = OpenGripper(config.gripper.preshape_m, config.gripper.tip_clearance_m)
+    gripper = OpenGripper.of(config)
     graspability = Graspability(inference, model, observation.labels, heightmap, gripper)
 
     def predict():

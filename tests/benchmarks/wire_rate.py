@@ -1,8 +1,8 @@
-"""How well the served UR controller keeps its 500 Hz. Run it: python -m tests.benchmarks.wire_rate [seconds].
+"""How well the served UR controller keeps its 500 Hz. Run it: python -m tests.benchmarks.wire_rate [seconds] [flood].
 
 The arm is a perfect one, so this is the server alone; `wire_cell` measures the whole cell.
 Three clients: one reads every variable but the registers and does the timing, one only reads the time, and one sends
-servo commands to the control loop at 500 Hz.
+servo commands to the control loop at 500 Hz. With `flood`, a fourth sends one program of a megabyte after another.
 """
 
 from __future__ import annotations
@@ -43,12 +43,25 @@ def _servo(ended: threading.Event) -> None:
             time.sleep(max(0.0, deadline - time.monotonic()))
 
 
-def main(seconds: float) -> None:
+def _flood(ended: threading.Event) -> None:
+    """Send programs that take long to read; each is refused at its end, and the control loop goes on."""
+    move = b"  movej([0,-1.57,1.57,-1.57,-1.57,0], a=1.4, v=1.0)\n"
+    program = b"sec large():\n" + move * (1_000_000 // len(move)) + b"end\n"
+    with socket.create_connection((_HOST, 30001), timeout=0.1) as client:
+        while not ended.is_set():
+            left = memoryview(program)
+            while left and not ended.is_set():
+                with contextlib.suppress(TimeoutError):
+                    left = left[client.send(left) :]
+
+
+def main(seconds: float, *, flood: bool) -> None:
     """Measure and print."""
     with ServedController(_HOST) as served, reading(_HOST, *_NAMES) as reader, reading(_HOST, "timestamp"):
         ended = threading.Event()
-        servo = threading.Thread(target=_servo, args=(ended,))
-        servo.start()
+        threads = [threading.Thread(target=act, args=(ended,)) for act in (_servo, *([_flood] if flood else []))]
+        for thread in threads:
+            thread.start()
         process = psutil.Process(served.process.pid)
         # The served cell gives its controller this priority; here the one who measures has it too.
         for pid in (process.pid, 0):
@@ -66,7 +79,8 @@ def main(seconds: float) -> None:
             execution.append(package["actual_execution_time"])
         cpu = process.cpu_percent()
         ended.set()
-        servo.join()
+        for thread in threads:
+            thread.join()
     t, stamp = np.array(arrivals), np.array(stamps, dtype=np.float64)
     # The least late package sets the origin.
     late = (t - stamp) - (t - stamp).min()
@@ -81,4 +95,4 @@ def main(seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0)
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else 10.0, flood="flood" in sys.argv)

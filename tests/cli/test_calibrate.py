@@ -19,6 +19,8 @@ CELL = """
 {camera}
 [journal]
 runs = "{runs}"
+[motion]
+joint_acceleration_rad_s2 = 4.0
 [backend.options]
 objects = 3
 tag = true

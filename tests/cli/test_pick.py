@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import logging
 import signal
@@ -14,6 +15,10 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from cli.main import app
+from cli.options import CellChoice
+from cli.pick import run_pick
+from robotcell.config import load_config
+from robotcell.jobs.journal import Journal
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,6 +45,8 @@ shape = "cylinder"
 color = "yellow"
 position = [0.1, -0.05, 0.025]
 """
+# An arm that is there sooner makes a job shorter, and no other one.
+BRISK = "[motion]\njoint_acceleration_rad_s2 = 4.0\nlinear_acceleration_m_s2 = 4.0\n"
 
 
 @pytest.fixture
@@ -48,7 +55,7 @@ def cell(tmp_path: Path) -> Path:
     (tmp_path / "blocks.toml").write_text(SCENE)
     path = tmp_path / "cell.toml"
     path.write_text(
-        f'[journal]\nruns = "{tmp_path / "runs"}"\n[backend.options]\nscene = "{tmp_path / "blocks.toml"}"\n'
+        f'[journal]\nruns = "{tmp_path / "runs"}"\n{BRISK}[backend.options]\nscene = "{tmp_path / "blocks.toml"}"\n'
     )
     return path
 
@@ -65,8 +72,11 @@ def run_json(*arguments: str | Path) -> dict[str, Any]:
     return summary
 
 
-def test_a_goal_is_picked_from_the_command_line(cell: Path) -> None:
+def test_a_goal_is_picked_from_the_command_line_and_a_refusal_has_the_same_keys_in_json(cell: Path) -> None:
+    refused = json.loads(run("pick", "--cell", cell, "--goal", "mauve", "--json").stdout)
     summary = run_json("pick", "--goal", "red", "--cell", cell)
+    assert refused.keys() == summary.keys()
+    assert refused["job"] is None
     assert summary["completed"] is True
     assert summary["picked"] == 1
     assert summary["actions"] == summary["pushes"] + summary["grasp_attempts"]
@@ -96,7 +106,7 @@ def run_as_process(*arguments: str | Path) -> dict[str, Any]:
 def test_the_same_seed_gives_the_same_job_to_the_last_action_in_every_process(tmp_path: Path) -> None:
     def once(folder: str, pick: Callable[..., dict[str, Any]]) -> tuple[Any, ...]:
         path = tmp_path / f"{folder}.toml"
-        path.write_text(f'[journal]\nruns = "{tmp_path / folder}"\n')
+        path.write_text(f'[journal]\nruns = "{tmp_path / folder}"\n{BRISK}')
         summary = pick("pick", "--all", "--cell", path, "--objects", "2", "--seed", "5")
         assert summary["picked"] == 2
         listing = run("jobs", "show", str(summary["job"]), "--cell", path).stdout
@@ -106,8 +116,13 @@ def test_the_same_seed_gives_the_same_job_to_the_last_action_in_every_process(tm
     assert once("first", run_as_process) == once("second", run_json)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_job_that_is_cut_off_is_on_record_as_stopped(cell: Path, number: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGHUP, 129, "the terminal was closed")],
+)
+def test_a_job_that_is_cut_off_is_on_record_as_stopped(
+    cell: Path, number: signal.Signals, code: int, words: str
+) -> None:
     # The heuristic policy starts without the libraries of the network.
     options = ["--all", "--policy", "heuristic", "--cell", str(cell)]
     command = [sys.executable, "-c", "from cli.main import main; main()", "pick", *options]
@@ -120,7 +135,7 @@ def test_a_job_that_is_cut_off_is_on_record_as_stopped(cell: Path, number: signa
         assert process.wait() == code
     shown = run("jobs", "show", "1", "--cell", cell).stdout
     assert "stopped" in shown
-    assert ("interrupted" if number is signal.SIGINT else "terminated") in shown
+    assert words in shown
 
 
 def test_a_dry_run_draws_and_moves_nothing(cell: Path, tmp_path: Path) -> None:
@@ -158,6 +173,9 @@ def test_jobs_are_listed_and_shown(cell: Path) -> None:
         (("--goal", "red", "--set", "limits"), 2, "say KEY=VALUE"),
         (("--goal", "red", "--policy", "oracle"), 2, "no policy is called 'oracle'"),
         (("--goal", "red", "--scene", "moon"), 2, "moon"),
+        (("--goal", "red", "--speed", "0.01"), 2, "--speed 0.01: Input should be greater than or equal to 0.05"),
+        (("--goal", "red", "--confirm"), 2, "there is no terminal to ask at"),
+        (("--goal", "red", "--confirm", "--dry-run"), 2, "a dry run moves nothing"),
         (("--goal", "green"), 1, "no green object"),
     ],
 )
@@ -165,6 +183,22 @@ def test_a_refusal_says_why(cell: Path, arguments: tuple[str, ...], code: int, m
     result = run("pick", "--cell", cell, *arguments)
     assert result.exit_code == code, result.output
     assert message in result.stderr
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_each_action_is_shown_and_asked_for_at_the_terminal(cell: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("n\ny\n"))
+    choice = CellChoice(cell, None, {"--policy": "heuristic", "--speed": 0.5})
+    assert run_pick("red", False, choice, confirm=True, dry_run=False, as_json=True) == 0
+    with Journal(load_config(cell).journal.database_url()) as journal:
+        job = journal.job(1)
+    assert [row.outcome.result for row in job.actions if row.outcome] == ["declined", "picked"]
+    assert job.config["motion"]["speed_fraction"] == 0.5
+    assert len(list(Path(job.run_dir).glob("confirm-*.png"))) == 2
 
 
 def test_what_was_done_before_a_refusal_is_in_the_json(cell: Path) -> None:
@@ -176,13 +210,6 @@ def test_what_was_done_before_a_refusal_is_in_the_json(cell: Path) -> None:
     assert summary["code"] == "no-target"
     assert summary["picked_objects"] == ["red"]
     assert (Path(summary["run_dir"]) / "summary.gif").is_file()
-
-
-def test_a_job_that_never_started_has_the_same_keys_in_json(cell: Path) -> None:
-    refused = json.loads(run("pick", "--cell", cell, "--goal", "mauve", "--json").stdout)
-    done = json.loads(run("pick", "--cell", cell, "--goal", "red", "--json").stdout)
-    assert refused.keys() == done.keys()
-    assert refused["job"] is None
 
 
 def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None:
@@ -198,7 +225,7 @@ def test_a_folder_that_cannot_be_made_is_a_storage_error(tmp_path: Path) -> None
 
 def test_brackets_in_a_path_are_printed_as_they_are(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
-    path.write_text(f'[journal]\nruns = "{tmp_path}/r[bold]x"\n[backend.options]\nobjects = 1\n')
+    path.write_text(f'[journal]\nruns = "{tmp_path}/r[bold]x"\n{BRISK}[backend.options]\nobjects = 1\n')
     result = run("pick", "--all", "--cell", path)
     assert result.exit_code == 0, result.output
     assert "r[bold]x" in result.stdout

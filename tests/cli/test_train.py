@@ -59,15 +59,9 @@ def test_help_imports_nothing_heavy() -> None:
 
 def test_it_trains_in_the_twin(config: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    done = subprocess.run(
-        command("--stage", 1, "--config", config, "--run", folder, "--workers", 1),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    # pybullet names its build on loading.
-    assert done.stdout.splitlines()[-1] == str(folder / "stage1" / "weights.safetensors")
+    done = run("--stage", "1", "--config", config, "--run", folder, "--workers", "1")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.splitlines() == [str(folder / "stage1" / "weights.safetensors")]
     assert "round 1/1: " in done.stderr
     line = json.loads((folder / "metrics.jsonl").read_text())
     assert line["attempts"] >= 4

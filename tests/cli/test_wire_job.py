@@ -13,11 +13,12 @@ import pytest
 
 from robotcell.config import load_config
 from sim_twin.wire.cell import ServedCell
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-HOST, MODBUS_PORT, CAMERA_PORT = "127.0.0.49", 15049, 30449
+HOST, MODBUS_PORT, CAMERA_PORT = loopback(49), 15049, 30449
 LIMIT_S = 240.0
 
 

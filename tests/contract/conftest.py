@@ -20,6 +20,7 @@ import pytest
 from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.interfaces import ArmMode
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from sim_twin.wire.cell import ServedCell
 
 TWIN = {"backend.name": "twin", "backend.options.objects": 1}
-HOST, MODBUS_PORT, CAMERA_PORT = "127.0.0.42", 15042, 30442
+HOST, MODBUS_PORT, CAMERA_PORT = loopback(42), 15042, 30442
 SERVED = {
     "backend.name": "hardware",
     "backend.options.arm.host": HOST,

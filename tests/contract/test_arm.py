@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
+from robotcell.findings import Grade
 from robotcell.geometry import rg2, ur5e
 from robotcell.geometry.transforms import make_transform, rotation_angle, rotation_z
-from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode
+from robotcell.interfaces import KICK_TIMEOUT_S, ArmMode, JointWaypoint, LinearWaypoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from robotcell.cell import Cell
     from robotcell.geometry.transforms import Array
+    from robotcell.interfaces import ArmState, Waypoint
     from tests.contract.conftest import Opened
 
 PERIOD_S = 0.008
@@ -34,17 +37,22 @@ def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:
         arm.state()
 
 
-@pytest.mark.parametrize("call", ["state", "stop", "kick", "recover", "moving", "start_joints", "start_linear"])
+@pytest.mark.parametrize(
+    "call",
+    ["state", "report", "stop", "kick", "recover", "moving", "start_joints", "start_linear", "start_path"],
+)
 def test_refuses_everything_before_it_is_connected(closed_cell: Cell, call: str) -> None:
     arm = closed_cell.arm
     calls: dict[str, Callable[[], object]] = {
         "state": arm.state,
+        "report": arm.report,
         "stop": arm.stop,
         "kick": arm.kick,
         "recover": arm.recover,
         "moving": lambda: arm.moving,
         "start_joints": lambda: arm.start_joints(np.zeros(6), 0.1, 0.1),
         "start_linear": lambda: arm.start_linear(np.eye(4), 0.1, 0.1),
+        "start_path": lambda: arm.start_path([JointWaypoint(np.zeros(6), 0.1, 0.1)]),
     }
     with pytest.raises(ConnectionLost):
         calls[call]()
@@ -59,6 +67,10 @@ def test_state_is_one_consistent_measurement(cell: Cell) -> None:
     # A real arm's own calibration differs from the nominal one by some millimetres.
     assert np.abs(state.T_base_tcp - ur5e.forward(state.q) @ tip).max() < 0.01
     np.testing.assert_allclose(state.q, cell.config.motion.home_q, atol=0.01)
+
+
+def test_a_connected_arm_reports_nothing_that_keeps_it_from_a_job(cell: Cell) -> None:
+    assert [finding for finding in cell.arm.report() if finding.grade is Grade.WRONG] == []
 
 
 def test_joint_motion_returns_at_once_and_arrives(cell: Cell, pace: float) -> None:
@@ -126,6 +138,89 @@ def test_stop_ends_a_motion_short_of_its_target(cell: Cell, pace: float) -> None
     assert state.q[0] - at_stop < 0.05
     np.testing.assert_allclose(state.qd, 0, atol=0.02)
     cell.arm.stop()
+
+
+def around_a_corner(cell: Cell, pace: float) -> tuple[list[Waypoint], Array]:
+    """A joint motion, a straight one and a joint motion, blended; and where the first corner is, base frame [m]."""
+    q = cell.arm.state().q
+    first, last = q + np.array((0.15, 0, 0, 0, 0, 0.2)), q + np.array((-0.15, 0.1, 0, 0, 0, 0))
+    tip = make_transform(np.eye(3), (0, 0, rg2.CLOSED_LENGTH_M))
+    corner = ur5e.forward(first) @ tip
+    down = corner.copy()
+    down[2, 3] -= 0.08
+    joint_pace = (0.8 * pace, 1.4 * pace**2)
+    return [
+        JointWaypoint(first, *joint_pace, blend_m=0.03),
+        LinearWaypoint(down, 0.2 * pace, 1.0 * pace**2, blend_m=0.03),
+        JointWaypoint(last, *joint_pace),
+    ], corner[:3, 3]
+
+
+def test_a_path_passes_its_corners_in_order_without_a_halt_and_ends_at_rest(cell: Cell, pace: float) -> None:
+    path, corner = around_a_corner(cell, pace)
+    cell.arm.start_path(path)
+    assert cell.arm.moving
+    states = followed(cell)
+    tcp = np.array([state.T_base_tcp[:3, 3] for state in states])
+    targets = (corner, corner - (0, 0, 0.08))
+    nearest = [int(np.linalg.norm(tcp - target, axis=1).argmin()) for target in targets]
+    assert 0 < nearest[0] < nearest[1] < len(states) - 1
+    for at, target in zip(nearest, targets, strict=True):
+        # Rounded: within the radius (and what a state may lag), and at speed.
+        assert 0.001 < np.linalg.norm(tcp[at] - target) < 0.03 + 0.005
+        assert np.abs(states[at].qd).max() > 0.03 * pace
+    state = cell.arm.state()
+    assert isinstance(path[-1], JointWaypoint)
+    np.testing.assert_allclose(state.q, path[-1].q, atol=2e-3)
+    np.testing.assert_allclose(state.qd, 0, atol=0.02)
+    assert state.mode is ArmMode.READY
+
+
+def test_a_stop_in_the_middle_of_a_corner_ends_a_path_there(cell: Cell, pace: float) -> None:
+    path, corner = around_a_corner(cell, pace)
+    cell.arm.start_path(path)
+    while np.linalg.norm(cell.arm.state().T_base_tcp[:3, 3] - corner) > 0.02:
+        assert cell.arm.moving
+        run(cell, PERIOD_S)
+    cell.arm.stop()
+    at_stop = cell.arm.state()
+    finish(cell)
+    run(cell, 0.2)
+    state = cell.arm.state()
+    assert state.mode is ArmMode.READY
+    assert np.abs(state.q - at_stop.q).max() < 0.1
+    assert np.linalg.norm(state.T_base_tcp[:3, 3] - corner) < 0.06
+    np.testing.assert_allclose(state.qd, 0, atol=0.02)
+    # The next motion starts from there.
+    cell.arm.start_path(path[-1:])
+    finish(cell)
+    assert isinstance(path[-1], JointWaypoint)
+    np.testing.assert_allclose(cell.arm.state().q, path[-1].q, atol=2e-3)
+
+
+def test_a_path_that_nobody_kicks_stops(cell: Cell, pace: float) -> None:
+    path, _ = around_a_corner(cell, pace)
+    cell.arm.start_path(path)
+    cell.clock.sleep(KICK_TIMEOUT_S + 0.5)
+    stopped = cell.arm.state()
+    assert not cell.arm.moving
+    assert isinstance(path[-1], JointWaypoint)
+    assert np.abs(stopped.q - path[-1].q).max() > 0.05
+    cell.clock.sleep(0.3)
+    np.testing.assert_allclose(cell.arm.state().q, stopped.q, atol=2e-3)
+
+
+def test_refuses_paths_that_are_none(cell: Cell, pace: float) -> None:
+    path, _ = around_a_corner(cell, pace)
+    for wrong in (
+        [],
+        [*path[:1], replace(path[1], blend_m=-0.01), path[2]],
+        [replace(path[0], blend_m=float("nan"))],
+        path[:1],
+    ):
+        with pytest.raises(UnsafeMotion):
+            cell.arm.start_path(wrong)
+    assert not cell.arm.moving
 
 
 def test_a_second_motion_waits_for_the_first(cell: Cell, pace: float) -> None:
@@ -227,3 +322,12 @@ def finish(cell: Cell) -> None:
     while cell.arm.moving:
         cell.arm.kick()
         cell.clock.sleep(PERIOD_S)
+
+
+def followed(cell: Cell) -> list[ArmState]:
+    """The states of a supervised motion until its end."""
+    states = [cell.arm.state()]
+    while cell.arm.moving:
+        run(cell, PERIOD_S)
+        states.append(cell.arm.state())
+    return states

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from robotcell.config.fingers import gripper_range
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from sim_twin.wire.faults import Fault, Kind
 
@@ -34,9 +35,15 @@ def test_connects_once_and_closes_twice(closed_cell: Cell) -> None:
 
 def test_refuses_everything_before_it_is_connected(closed_cell: Cell) -> None:
     gripper = closed_cell.gripper
-    for call in (gripper.state, gripper.stop, lambda: gripper.start_width(0.05, 20.0)):
+    for call in (gripper.state, gripper.range, gripper.stop, lambda: gripper.start_width(0.05, 20.0)):
         with pytest.raises(ConnectionLost):
             call()
+
+
+def test_reports_the_range_that_its_backend_says_it_has(cell: Cell) -> None:
+    reach = cell.gripper.range()
+    assert reach == gripper_range(cell.config)
+    assert 0.0 <= reach.min_width_m < cell.gripper.state().width_m <= reach.max_width_m
 
 
 def test_recover_works_without_a_connection(closed_cell: Cell) -> None:

@@ -8,7 +8,8 @@ import pytest
 from robotcell.cell import Cell
 from robotcell.config import CellConfig
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault
-from robotcell.interfaces import Devices
+from robotcell.geometry.rg2 import range_with_tips
+from robotcell.interfaces import Devices, GripperRange
 
 
 @dataclass
@@ -25,6 +26,9 @@ class Device:
 
     def close(self) -> None:
         self.calls.append("close")
+
+    def range(self) -> GripperRange:
+        return range_with_tips(0.0)
 
 
 def cell_of(*devices: Device) -> Cell:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,6 +27,8 @@ from robotcell.errors import CellError, ConnectionLost, DeviceFault
 from robotcell.interfaces import Camera, RgbdFrame
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robotcell.config import CameraMount
     from robotcell.drivers.d415.source import CameraSource
     from robotcell.interfaces import Clock
@@ -83,6 +87,10 @@ class D415(Camera):
         # What is connected, in words; empty before.
         self.description = ""
         self._frame_check = FrameCheck(clock, recorded=self._recorded)
+        # Of the polls for one frame: since when, what has come of it, and what was wrong with the last frame.
+        self._polled_since = math.nan
+        self._polled: list[Any] = []
+        self._poll_problem = ""
 
     def connect(self) -> None:
         """Start the streams and wait until exposure has settled. Tries three times, the last after a hardware reset.
@@ -141,13 +149,39 @@ class D415(Camera):
                 t, number = self._frame_check.check(frameset, called)
                 framesets.append(frameset)
                 if len(framesets) == self._options.temporal_frames:
-                    color, depth_m = self._images.make(framesets)
-                    framesets.clear()
-                    check_images(color, depth_m)
-                    return RgbdFrame(t, number, color, depth_m, self._images.intrinsics, self._serial)
+                    return _develop(self._images, framesets, t, number, self._serial)
             except DeviceFault as fault:
                 problem = str(fault)
         raise DeviceFault(problem, device="camera") if problem else ConnectionLost(silence, device="camera")
+
+    def poll(self, since: float) -> Callable[[], RgbdFrame] | None:
+        """A frame that was taken at `since` or later; see `Camera`.
+
+        Raises:
+            ConnectionLost: no frame has come for a second since then, or the camera is not connected.
+            DeviceFault: for a second all frames were stale, repeated, or had colour and depth of different moments.
+        """
+        images, serial = self._images, self._serial
+        if images is None:
+            raise ConnectionLost("camera: it is not connected; call connect() first", device="camera")
+        if since != self._polled_since:
+            self._polled_since, self._polled, self._poll_problem = since, [], ""
+        with sdk_errors("asking for a frame"):
+            frameset = self._pipeline.poll_for_frames()
+        if frameset.size():
+            try:
+                t, number = self._frame_check.check(frameset, since)
+                self._polled.append(frameset)
+                if len(self._polled) == self._options.temporal_frames:
+                    framesets, self._polled = self._polled, []
+                    return functools.partial(_develop, images, framesets, t, number, serial)
+            except DeviceFault as fault:
+                self._poll_problem = str(fault)
+        if self._clock.now() - since > _FRAME_S * self._options.temporal_frames:
+            if self._poll_problem:
+                raise DeviceFault(self._poll_problem, device="camera")
+            raise ConnectionLost(f"camera: no frame came within {_FRAME_S:g} s; {USB_ADVICE}", device="camera")
+        return None
 
     def _connect(self) -> None:
         rs = load_pyrealsense2()
@@ -229,3 +263,15 @@ class D415(Camera):
         with sdk_errors("waiting for a frame"):
             came, frameset = self._pipeline.try_wait_for_frames(max(1, round(seconds * 1000)))
         return frameset if came else None
+
+
+def _develop(images: D415Images, framesets: list[Any], t: float, number: int, serial: str | None) -> RgbdFrame:
+    """The frame of its raw framesets, which are let go.
+
+    Raises:
+        DeviceFault: its images are of no use.
+    """
+    color, depth_m = images.make(framesets)
+    framesets.clear()
+    check_images(color, depth_m)
+    return RgbdFrame(t, number, color, depth_m, images.intrinsics, serial)

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.drivers.doctor.findings import Finding, Grade, milliseconds
-from robotcell.drivers.ur5e.controller import IN_USE_CURE, inputs_in_use, inspect, obstacles, program_held
+from robotcell.drivers.doctor.timing import milliseconds
+from robotcell.drivers.ur5e.controller import IN_USE_CURE, inputs_in_use, inspect, program_held
+from robotcell.drivers.ur5e.controller_findings import controller_findings, tool_findings
 from robotcell.drivers.ur5e.dashboard import Dashboard
 from robotcell.drivers.ur5e.rtde import as_number, open_rtde
-from robotcell.geometry import rg2
-from robotcell.geometry.transforms import matrix_to_rotvec
+from robotcell.findings import Finding, Grade
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,20 +42,10 @@ def examine_arm(options: UR5eOptions, seconds: float, state_age_s: float) -> Ite
         ConnectionLost: it cannot be reached, or answers no longer.
     """
     controller = inspect(options.host)
-    yield Finding("arm", "PolyScope", ".".join(map(str, controller.version)))
-    yield Finding("arm", "model, serial", f"{controller.model}, {controller.serial}")
-    yield Finding("arm", "remote control", "on" if controller.remote else "off")
-    yield Finding("arm", "speed slider", f"{100 * controller.speed_fraction:.0f} %")
-    for cure in obstacles(controller):
-        yield Finding("arm", "ready", "no", Grade.WRONG, cure)
-    if controller.protective_stop:
-        yield Finding("arm", "safety", "protective stop", Grade.WRONG, "look at the cell, then robotcell recover")
+    yield from controller_findings(controller)
     held = program_held(controller.runtime_state)
     yield Finding("arm", "program", held or "none runs", Grade.WRONG if held else Grade.OK, held)
-    T = rg2.T_FLANGE_TCP
-    tcp = (*T[:3, 3], *matrix_to_rotvec(T[:3, :3]))
-    yield _compare("TCP [m, rad]", controller.tcp_offset, tcp, 1e-4)
-    yield _compare("payload [kg]", (controller.payload_kg,), (options.payload_kg,), 1e-3)
+    yield from tool_findings(controller, options.payload_kg, options.payload_cog, changed=False)
     in_use = inputs_in_use(options.host, _INPUTS)
     yield Finding(
         "arm",
@@ -66,15 +56,6 @@ def examine_arm(options: UR5eOptions, seconds: float, state_age_s: float) -> Ite
     )
     yield from _time_rtde(options.host, seconds, state_age_s)
     yield _time_dashboard(options.host)
-
-
-def _compare(what: str, found: tuple[float, ...], wanted: tuple[float, ...], tolerance: float) -> Finding:
-    text = ", ".join(f"{value:.4g}" for value in found)
-    if np.allclose(found, wanted, atol=tolerance):
-        return Finding("arm", what, text)
-    cell = ", ".join(f"{value:.4g}" for value in wanted)
-    cure = f"the cell's is {cell}: it is set at connect; enter it in the installation too, for jogging and freedrive"
-    return Finding("arm", what, text, Grade.NOTE, cure)
 
 
 def _time_rtde(host: str, seconds: float, state_age_s: float) -> Iterator[Finding]:

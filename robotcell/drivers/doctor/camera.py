@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.d415.camera import D415
-from robotcell.drivers.doctor.findings import Finding, Grade, milliseconds
+from robotcell.drivers.doctor.timing import milliseconds
 from robotcell.errors import ConfigError
+from robotcell.findings import Finding, Grade
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotcell.drivers.doctor.findings import Finding, Grade
+from robotcell.findings import Finding, Grade
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,9 +12,9 @@ from robotcell.drivers.backend import HardwareOptions
 from robotcell.drivers.doctor.arm import examine_arm
 from robotcell.drivers.doctor.camera import examine_calibration, examine_camera
 from robotcell.drivers.doctor.computer import examine_computer
-from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.drivers.doctor.gripper import examine_gripper
-from robotcell.errors import CellError, ConfigError
+from robotcell.errors import ConfigError
+from robotcell.findings import Finding, collect
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -41,19 +41,9 @@ def examine(config: CellConfig, seconds: float) -> list[Finding]:
     rounds: list[tuple[str, Callable[[], Iterator[Finding]]]] = [
         ("computer", lambda: examine_computer(options.camera.source)),
         ("arm", lambda: examine_arm(options.arm, seconds, config.limits.state_age_s)),
-        ("gripper", lambda: examine_gripper(options.gripper, seconds)),
+        ("gripper", lambda: examine_gripper(options.gripper, config, seconds)),
         ("camera", lambda: examine_camera(options.camera, config.camera, seconds)),
         ("calibration", lambda: examine_calibration(config.camera)),
     ]
     with ThreadPoolExecutor(len(rounds)) as pool:
-        return [finding for found in pool.map(lambda args: _collect(*args), rounds) for finding in found]
-
-
-def _collect(device: str, look: Callable[[], Iterator[Finding]]) -> list[Finding]:
-    """What a round finds, up to the error that ends it."""
-    found: list[Finding] = []
-    try:
-        found.extend(look())
-    except CellError as error:
-        found.append(Finding(device, "reach" if not found else "further", "failed", Grade.WRONG, str(error)))
-    return found
+        return [finding for found in pool.map(lambda args: collect(*args), rounds) for finding in found]

@@ -30,6 +30,8 @@ _PUSHED = {"S1": 1 << 2, "S2": 1 << 4}
 _PRODUCTS = {0x20: "RG2", 0x21: "RG6", 0x22: "RG2-FT"}
 # The Compute Box itself, and what switches its tool off and on again.
 _BOX_UNIT, _POWER_CYCLE = 63, 2
+# Responses have 260 bytes at most; late ones of earlier requests may come before.
+_LONGEST_RESPONSE = 1 << 16
 # The box's own unit of length and of force is a tenth of a millimetre and of a newton.
 _PER_M, _PER_N = 10_000, 10
 _EXCEPTIONS = {
@@ -175,6 +177,9 @@ class ComputeBox:
 
     def _hear(self, sending: bool, data: bytes) -> bytes:
         self._heard = not sending
+        # All that has come since the request and was not understood.
+        if not sending and len(data) > _LONGEST_RESPONSE:
+            raise ValueError(f"{len(data)} bytes")
         return data
 
     def _read(self, address: int, count: int, what: str) -> Sequence[int]:

@@ -15,7 +15,7 @@ from robotcell.drivers.rg2.compute_box import BoxState, ComputeBox
 from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.errors import ConnectionLost, DeviceFault, UnsafeMotion
 from robotcell.geometry import rg2
-from robotcell.interfaces import Gripper, GripperState
+from robotcell.interfaces import Gripper, GripperRange, GripperState
 
 if TYPE_CHECKING:
     from robotcell.interfaces import Clock
@@ -68,8 +68,8 @@ class RG2(Gripper):
         self._options = options
         self._clock = clock
         self._box = ComputeBox(options.host, options.port, options.unit, options.timeout_s)
-        # Between the tips [m]; the tips shift the range of the bare fingers.
-        self._range_m = (rg2.MIN_WIDTH_M, rg2.MAX_WIDTH_M)
+        # With the tips that the box says are mounted.
+        self._range = rg2.range_with_tips(options.fingertip_offset_m)
         # The last command (width [m], force [N]) and when it was given; None after a stop.
         self._command: tuple[float, float] | None = None
         self._commanded_at = -math.inf
@@ -91,10 +91,7 @@ class RG2(Gripper):
             if product != "RG2":
                 raise self._refusal(f"the gripper is {product}, not an RG2; correct gripper.unit or the driver")
             self._set_offset()
-            state = self._free_state()
-            shift = state.tip_width_m - state.bare_width_m
-            # The register of the width takes no more with tips that reach outwards.
-            self._range_m = max(0.0, rg2.MIN_WIDTH_M + shift), min(rg2.MAX_WIDTH_M + shift, rg2.MAX_WIDTH_M)
+            self._range = rg2.range_with_tips(self._free_state().offset_m)
             self._command = None
         except BaseException:
             self.close()
@@ -134,6 +131,15 @@ class RG2(Gripper):
             grip = grip and astray > _REACHED_M
         return GripperState(t=t, width_m=width, busy=busy, grip_detected=grip and not busy)
 
+    def range(self) -> GripperRange:
+        """What the box says that the gripper reaches with its tips; see `Gripper`.
+
+        Raises:
+            ConnectionLost: the gripper is not connected.
+        """
+        self._box.need_link()
+        return self._range
+
     def start_width(self, width_m: float, force_n: float) -> None:
         """Start moving the fingers; see `Gripper`. Fingers on their way to elsewhere are stopped first.
 
@@ -143,8 +149,9 @@ class RG2(Gripper):
             UnsafeMotion: width or force are outside the gripper's range.
         """
         self._box.need_link()
-        _check_range("width", 1000 * width_m, 1000 * self._range_m[0], 1000 * self._range_m[1], "mm")
-        _check_range("force", force_n, rg2.MIN_FORCE_N, rg2.MAX_FORCE_N, "N")
+        reach = self._range
+        _check_range("width", 1000 * width_m, 1000 * reach.min_width_m, 1000 * reach.max_width_m, "mm")
+        _check_range("force", force_n, reach.min_force_n, reach.max_force_n, "N")
         if self._free_state().busy:
             if self._command == (width_m, force_n):
                 return

@@ -20,20 +20,23 @@ from pydantic import BaseModel, ConfigDict, Field
 from robotcell.drivers.unconfirmed import warn_unconfirmed
 from robotcell.drivers.ur5e.child_process import ChildProcess
 from robotcell.drivers.ur5e.controller import arm_mode, inspect, obstacles, program_held, slow_slider, why_not_ready
+from robotcell.drivers.ur5e.controller_findings import TCP_OFFSET, controller_findings, tool_findings
 from robotcell.drivers.ur5e.dashboard import Dashboard
-from robotcell.drivers.ur5e.messages import Setup, StartJoints, StartLinear
+from robotcell.drivers.ur5e.messages import Setup, StartJoints, StartLinear, StartPath
 from robotcell.errors import CellError, ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
-from robotcell.geometry import rg2
-from robotcell.geometry.controller_ranges import check_joint_motion, check_linear_motion
+from robotcell.geometry.controller_ranges import check_path_motion
 from robotcell.geometry.transforms import make_transform, matrix_to_rotvec, rotvec_to_matrix
-from robotcell.interfaces import Arm, ArmMode, ArmState
+from robotcell.interfaces import Arm, ArmMode, ArmState, JointWaypoint, LinearWaypoint
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from robotcell.drivers.ur5e.controller import Controller
+    from robotcell.findings import Finding
     from robotcell.geometry.transforms import Array
-    from robotcell.interfaces import Clock
+    from robotcell.interfaces import Clock, Waypoint
 
 _LOG = logging.getLogger(__name__)
 
@@ -138,6 +141,13 @@ class UR5e(Arm):
             mode=_mode(record),
         )
 
+    def report(self) -> tuple[Finding, ...]:
+        """What the controller says of itself and of the tool that was set at connect; see `Arm`."""
+        self._record()
+        controller = inspect(self._options.host)
+        tool = tool_findings(controller, self._options.payload_kg, self._options.payload_cog, changed=True)
+        return (*controller_findings(controller), *tool)
+
     def start_joints(self, q: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint-space motion; see `Arm`.
 
@@ -146,9 +156,7 @@ class UR5e(Arm):
                 the controller's range, or the arm is moving.
             DeviceFault: the arm is stopped, or its speed slider is at zero.
         """
-        self._need_ready()
-        target = check_joint_motion(q, speed_rad_s, acceleration_rad_s2)
-        self._start(StartJoints(tuple(target.tolist()), float(speed_rad_s), float(acceleration_rad_s2)))
+        self.start_path((JointWaypoint(q, speed_rad_s, acceleration_rad_s2),))
 
     def start_linear(self, T_base_tcp: Array, speed_m_s: float, acceleration_m_s2: float) -> None:
         """Start a straight motion of the tcp; see `Arm`.
@@ -160,10 +168,22 @@ class UR5e(Arm):
                 the arm is moving.
             DeviceFault: the arm is stopped, or its speed slider is at zero.
         """
+        self.start_path((LinearWaypoint(T_base_tcp, speed_m_s, acceleration_m_s2),))
+
+    def start_path(self, waypoints: Sequence[Waypoint]) -> None:
+        """Start a motion along several legs; see `Arm`. A path of one leg is the motion of that leg.
+
+        The controller rounds the corners by its own rule, within the radii. ur_rtde has no command for a path: it ends
+        our program and sends it anew with the path in it, which takes a tenth of a second and leaves the arm standing.
+
+        Raises:
+            UnsafeMotion: a leg is outside the ranges, a blend radius too, or the arm is moving.
+            DeviceFault: the arm is stopped, or its speed slider is at zero.
+        """
         self._need_ready()
-        target = check_linear_motion(T_base_tcp, speed_m_s, acceleration_m_s2)
-        pose = (*target[:3, 3].tolist(), *matrix_to_rotvec(target[:3, :3]).tolist())
-        self._start(StartLinear(pose, float(speed_m_s), float(acceleration_m_s2)))
+        legs = check_path_motion(waypoints)
+        messages = tuple(_leg(leg) for leg in legs)
+        self._start(messages[0] if len(legs) == 1 else StartPath(messages, tuple(float(leg.blend_m) for leg in legs)))
 
     def stop(self) -> None:
         """Brake the tool at 10 m/s^2.
@@ -234,7 +254,8 @@ class UR5e(Arm):
         while _mode(self._record()) is ArmMode.PROTECTIVE_STOP:
             if time.monotonic() > deadline:
                 raise DeviceFault(
-                    "the protective stop came back at once: free the arm with freedrive at the pendant, then recover",
+                    "the protective stop came back at once: free the arm with freedrive at the pendant, then run "
+                    "robotcell recover",
                     device="arm",
                 )
             self._clock.sleep(_POLL_S)
@@ -257,11 +278,10 @@ class UR5e(Arm):
 
     def _start_child(self, *, control: bool) -> None:
         options = self._options
-        T = rg2.T_FLANGE_TCP
         setup = Setup(
             host=options.host,
             control=control,
-            tcp_offset=(*T[:3, 3].tolist(), *matrix_to_rotvec(T[:3, :3]).tolist()),
+            tcp_offset=TCP_OFFSET,
             payload_kg=options.payload_kg,
             payload_cog=options.payload_cog,
         )
@@ -270,7 +290,7 @@ class UR5e(Arm):
         if refusal:
             raise DeviceFault(f"the arm at {options.host}: {refusal}", device="arm")
 
-    def _start(self, motion: StartJoints | StartLinear) -> None:
+    def _start(self, motion: StartJoints | StartLinear | StartPath) -> None:
         child = self._need_child()
         child.kick()
         try:
@@ -328,6 +348,14 @@ class UR5e(Arm):
         return ConnectionLost(
             f"the arm at {self._options.host} is lost: {self._lost}, then connect again", device="arm"
         )
+
+
+def _leg(waypoint: Waypoint) -> StartJoints | StartLinear:
+    if isinstance(waypoint, JointWaypoint):
+        return StartJoints(tuple(waypoint.q.tolist()), float(waypoint.speed_rad_s), float(waypoint.acceleration_rad_s2))
+    T = waypoint.T_base_tcp
+    pose = (*T[:3, 3].tolist(), *matrix_to_rotvec(T[:3, :3]).tolist())
+    return StartLinear(pose, float(waypoint.speed_m_s), float(waypoint.acceleration_m_s2))
 
 
 def _mode(record: np.void) -> ArmMode:

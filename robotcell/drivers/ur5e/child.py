@@ -15,7 +15,7 @@ from mmap import mmap
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, NoReturn
 
-from robotcell.drivers.ur5e.messages import Answer, Close, StartJoints, StartLinear
+from robotcell.drivers.ur5e.messages import Answer, Close, StartJoints, StartLinear, StartPath
 from robotcell.drivers.ur5e.session import Session
 from robotcell.errors import ConnectionLost
 
@@ -62,7 +62,7 @@ def _serve(session: Session, pipe: Connection) -> None:
             session.end()
             return
         session.publish()
-        if isinstance(request, (StartJoints, StartLinear)):
+        if isinstance(request, (StartJoints, StartLinear, StartPath)):
             pipe.send(Answer(session.start(request)))
         session.supervise()
 

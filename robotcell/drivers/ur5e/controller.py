@@ -182,15 +182,15 @@ def arm_mode(robot_mode: int, safety_mode: int, *, ready: bool) -> ArmMode:
 def why_not_ready(robot_mode: int, safety_mode: int) -> str:
     """What happened to an arm whose mode is not READY, and what to do."""
     if safety_mode == PROTECTIVE_STOP:
-        return "the arm is in a protective stop: look at the cell, clear the contact, then recover"
+        return "the arm is in a protective stop: look at the cell, clear the contact, then run robotcell recover"
     if safety_mode in _SAFETY_CURES:
-        return f"the arm is {_SAFETY_CURES[safety_mode]}; then recover"
+        return f"the arm is {_SAFETY_CURES[safety_mode]}; then run robotcell recover"
     if robot_mode != _RUNNING:
         mode = _ROBOT_MODES.get(robot_mode, f"in robot mode {robot_mode}")
-        return f"the arm is {mode}: {_POWER_ON}; then recover"
+        return f"the arm is {mode}: {_POWER_ON}; then run robotcell recover"
     return (
         "the arm's program was stopped or paused (at the pendant, by the watchdog, or by a motion that the controller "
-        "cannot do), or another program is on it: look at the cell, then recover"
+        "cannot do), or another program is on it: look at the cell, then run robotcell recover"
     )
 
 

@@ -10,6 +10,9 @@ from robotcell.errors import ConnectionLost
 
 PORT = 29999
 TIMEOUT_S = 1.0
+_PIECE = 4096
+# The longest answer of a dashboard has some hundred bytes.
+_LONGEST_LINE = 1 << 16
 
 
 class Dashboard:
@@ -64,8 +67,9 @@ class Dashboard:
             connection.setblocking(False)
             with suppress(BlockingIOError):
                 # Answers that nobody waited for.
-                while connection.recv(4096):
-                    pass
+                for _ in range(_LONGEST_LINE // _PIECE):
+                    if not connection.recv(_PIECE):
+                        break
             self._pending = b""
             connection.sendall(command.encode("ascii") + b"\n")
         except OSError as error:
@@ -84,7 +88,7 @@ class Dashboard:
         while b"\n" not in self._pending:
             try:
                 connection.settimeout(max(deadline - time.monotonic(), 0.001))
-                more = connection.recv(4096)
+                more = connection.recv(_PIECE)
             except TimeoutError:
                 raise ConnectionLost(
                     f"{self._host}:{PORT} (dashboard) did not answer within {TIMEOUT_S:g} s", device="arm"
@@ -96,5 +100,9 @@ class Dashboard:
             if not more:
                 raise ConnectionLost(f"{self._host}:{PORT} (dashboard) closed the connection", device="arm")
             self._pending += more
+            if b"\n" not in more and (len(self._pending) > _LONGEST_LINE or time.monotonic() > deadline):
+                raise ConnectionLost(
+                    f"{self._host}:{PORT} (dashboard) sends no line; a dashboard server is needed", device="arm"
+                )
         line, _, self._pending = self._pending.partition(b"\n")
         return line.decode("utf-8", "replace").strip()

@@ -73,6 +73,14 @@ class StartLinear:
 
 
 @dataclass(frozen=True)
+class StartPath:
+    """Start one motion along legs whose corners are rounded, each within the radius that goes with it [m]."""
+
+    legs: tuple[StartJoints | StartLinear, ...]
+    blends_m: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Close:
     """Stop the arm, end our program, and end."""
 
@@ -84,4 +92,4 @@ class Answer:
     refusal: str = ""
 
 
-Request: TypeAlias = Setup | StartJoints | StartLinear | Close
+Request: TypeAlias = Setup | StartJoints | StartLinear | StartPath | Close

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 PORT = 30004
 # How long a controller may take for an answer, or for its next data package.
 TIMEOUT_S = 1.0
+# Before an answer, at most so many data packages and texts come: a stream of 500 Hz has 500 in the time of an answer.
+_MOST_PASSED_OVER = 1000
 
 _HEADER = struct.Struct(">HB")
 _VERSION, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA, _TEXT = 86, 118, 79, 73, 83, 85, 77
@@ -123,7 +125,7 @@ class RtdeReader:
     def _receive(self, wanted: int) -> bytes:
         """The payload of the next message of a kind; what else comes is passed over."""
         deadline = time.monotonic() + TIMEOUT_S
-        while True:
+        for _ in range(_MOST_PASSED_OVER):
             size, kind = _HEADER.unpack(self._take(_HEADER.size, deadline))
             if size < _HEADER.size:
                 raise self._wrong("it answers with something that is not RTDE")
@@ -132,6 +134,7 @@ class RtdeReader:
                 return payload
             if kind not in (_TEXT, _DATA):
                 raise self._wrong(f"it answers with a message of kind {kind}")
+        raise self._wrong(f"it sends {_MOST_PASSED_OVER} messages and not the one that it was asked for")
 
     def _take(self, count: int, deadline: float) -> bytes:
         while len(self._pending) < count:
@@ -144,6 +147,8 @@ class RtdeReader:
                 raise self._wrong(f"the connection broke: {error}") from error
             if not more:
                 raise self._wrong("it closed the connection")
+            if time.monotonic() > deadline and len(self._pending) + len(more) < count:
+                raise self._wrong(f"it sent no whole message for {TIMEOUT_S:g} s")
             self._pending += more
         taken, self._pending = self._pending[:count], self._pending[count:]
         return taken

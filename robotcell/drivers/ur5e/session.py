@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from robotcell.drivers.ur5e.clock_offset import ClockOffset
 from robotcell.drivers.ur5e.controller import IN_USE_CURE, PLAYING, PROTECTIVE_STOP, STOPPED
-from robotcell.drivers.ur5e.messages import STATE, SUPERVISION, SUPERVISION_OFFSET, StartJoints
+from robotcell.drivers.ur5e.messages import STATE, SUPERVISION, SUPERVISION_OFFSET, StartJoints, StartPath
 from robotcell.errors import ConnectionLost
 from robotcell.interfaces import KICK_TIMEOUT_S
 from robotcell.io.shared_record import SharedRecord
@@ -185,10 +185,12 @@ class Session:
             elif time.monotonic() - self._commanded_at > _MOTION_BEGINS_S:
                 raise ConnectionLost("the controller took a motion and did not begin it", device="arm")
 
-    def start(self, motion: StartJoints | StartLinear) -> str:
+    def start(self, motion: StartJoints | StartLinear | StartPath) -> str:
         """Start a motion; "" or why that was refused."""
         if self._control is None or self._interrupted:
             return "the controller does not run our program"
+        if isinstance(motion, StartPath):
+            return self._start_path(motion)
         if not self._set_watchdog(_MOVING_WATCHDOG_HZ):
             return "the controller did not arm its watchdog"
         operation = self._control.getAsyncOperationProgressEx().operationId()
@@ -198,10 +200,37 @@ class Session:
             taken = self._control.moveL(list(motion.tcp_pose), motion.speed_m_s, motion.acceleration_m_s2, True)
         if not taken:
             return "the controller did not take the motion"
+        self._begun(operation)
+        return ""
+
+    def _start_path(self, motion: StartPath) -> str:
+        """End our program and send it anew with the path in it, as ur_rtde does: tool and payload stay as they were."""
+        from rtde_control import Path, PathEntry
+
+        path = Path()
+        for leg, blend_m in zip(motion.legs, motion.blends_m, strict=True):
+            if isinstance(leg, StartJoints):
+                kind, position = PathEntry.eMoveType.MoveJ, PathEntry.ePositionType.PositionJoints
+                numbers = [*leg.q, leg.speed_rad_s, leg.acceleration_rad_s2, blend_m]
+            else:
+                kind, position = PathEntry.eMoveType.MoveL, PathEntry.ePositionType.PositionTcpPose
+                numbers = [*leg.tcp_pose, leg.speed_m_s, leg.acceleration_m_s2, blend_m]
+            path.addEntry(PathEntry(kind, position, numbers))
+        operation = self._control.getAsyncOperationProgressEx().operationId()
+        taken = self._control.movePath(path, True)
+        # The new program has no watchdog yet.
+        self._watchdog_hz = 0.0
+        if not taken or not self._set_watchdog(_MOVING_WATCHDOG_HZ):
+            self._stop()
+            return "the controller did not take the path"
+        self._begun(operation)
+        return ""
+
+    def _begun(self, operation: int) -> None:
+        """A motion was commanded after the operation of that number."""
         self._operation, self._commanded_at = operation, time.monotonic()
         self._moving, self._stop_sent, self._ended_at = True, False, math.inf
         self._state.write(moving=True)
-        return ""
 
     def supervise(self) -> None:
         """Stop when asked to, or when nobody supervises the motion; and keep the controller's watchdog quiet."""

@@ -6,10 +6,9 @@ import contextlib
 import queue
 import socket
 import threading
-import time
 
 from robotcell.errors import ConnectionLost
-from sim_twin.wire.d415.stream import Request, read_message
+from sim_twin.wire.d415.stream import InTime, Request, read_message
 
 _REQUEST_S = 2.0
 # A megapixel frame takes 0.5 s through 100 Mbit/s.
@@ -56,7 +55,7 @@ class Client:
     def _serve(self) -> None:
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            message = read_message(_InTime(self._connection, self._request_s))
+            message = read_message(InTime(self._connection, self._request_s))
             if not isinstance(message, Request):
                 return
             # Of a whole message, however it is cut.
@@ -68,19 +67,3 @@ class Client:
             pass  # the client left, or is none
         finally:
             self.gone = True
-
-
-class _InTime:
-    """Reads a connection until a time, however little comes at once."""
-
-    def __init__(self, connection: socket.socket, within_s: float) -> None:
-        self._connection = connection
-        self._deadline = time.monotonic() + within_s
-
-    def readinto(self, buffer: memoryview, /) -> int:
-        """Fill a buffer as far as possible; 0 at the end."""
-        left_s = self._deadline - time.monotonic()
-        if left_s <= 0:
-            raise TimeoutError("the client does not say what it wants")
-        self._connection.settimeout(left_s)
-        return self._connection.recv_into(buffer)

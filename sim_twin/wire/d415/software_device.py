@@ -15,7 +15,7 @@ import numpy as np
 from robotcell.drivers.d415.realsense import load_pyrealsense2
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.d415.noise import BASELINE_M
-from sim_twin.wire.d415.stream import Description, Frame, Request, encode, read_message
+from sim_twin.wire.d415.stream import Description, Frame, InTime, Request, encode, read_message
 
 if TYPE_CHECKING:
     from io import BufferedReader
@@ -49,7 +49,8 @@ def open_source(address: str, resolution: str) -> StreamedCamera:
     stream = connection.makefile("rb")
     try:
         connection.sendall(encode(Request(resolution=resolution)))
-        description = read_message(stream)
+        # Past the buffer of the stream, which has no clock.
+        description = read_message(InTime(connection, _CONNECT_S))
         if not isinstance(description, Description):
             raise ConnectionLost(f"camera: {address} does not say which camera it serves")
         connection.settimeout(None)

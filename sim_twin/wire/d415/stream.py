@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import struct
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Protocol, TypeAlias
 
@@ -21,6 +22,8 @@ from sim_twin.d415.noise import DEPTH_UNIT_M
 from sim_twin.d415.renderer import FRAMES_PER_S, SERIAL
 
 if TYPE_CHECKING:
+    import socket
+
     from robotcell.interfaces import Intrinsics
 
 # One that current SDKs take.
@@ -33,6 +36,9 @@ _REQUEST, _DESCRIPTION, _FRAME_KIND = 1, 2, 3
 # The largest that a message of each kind can be: 1280x720 pixels of five bytes, and JSON with room to spare.
 _LONGEST = {_REQUEST: 1000, _DESCRIPTION: 10_000, _FRAME_KIND: _FRAME.size + 1280 * 720 * 5}
 
+# Of a frame: librealsense keeps it in 32 bits, with a sign.
+_LAST_NUMBER = 2**31 - 1
+
 _Text = Annotated[str, Field(min_length=1, max_length=100)]
 _Side = Annotated[int, Field(ge=1, le=1280)]
 _Positive = Annotated[float, Field(gt=0)]
@@ -44,6 +50,31 @@ class Reader(Protocol):
     def readinto(self, buffer: memoryview, /) -> int | None:
         """Fill a buffer as far as possible; 0 at the end."""
         ...
+
+
+class InTime:
+    """Reads a connection until a time, however little comes at once.
+
+    Args:
+        connection: that is read.
+        within_s: seconds from now.
+    """
+
+    def __init__(self, connection: socket.socket, within_s: float) -> None:
+        self._connection = connection
+        self._deadline = time.monotonic() + within_s
+
+    def readinto(self, buffer: memoryview, /) -> int:
+        """Fill a buffer as far as possible; 0 at the end.
+
+        Raises:
+            OSError: the connection is lost, or the time is over.
+        """
+        left_s = self._deadline - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("no whole message came in time")
+        self._connection.settimeout(left_s)
+        return self._connection.recv_into(buffer)
 
 
 class _Json(BaseModel):
@@ -170,6 +201,8 @@ def _frame(payload: bytearray) -> Frame:
         raise ValueError(f"a frame of {width}x{height} pixels cannot have {len(payload)} bytes")
     if not np.isfinite([depth_t, color_t]).all():
         raise ValueError("a frame has no time")
+    if max(depth_number, color_number) > _LAST_NUMBER:
+        raise ValueError("a frame has a number that no camera counts to")
     depth = np.frombuffer(payload, "<u2", pixels, _FRAME.size).reshape(height, width)
     color = np.frombuffer(payload, np.uint8, 3 * pixels, _FRAME.size + 2 * pixels).reshape(height, width, 3)
     return Frame(Image(depth_number, depth_t, depth), Image(color_number, color_t, color))

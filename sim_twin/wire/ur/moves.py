@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from robotcell.geometry import ur5e
-from robotcell.geometry.transforms import matrix_to_rotvec
-from sim_twin.devices.arm_limits import ROTATION_LEVER_M, STOP_DECELERATION_RAD_S2
-from sim_twin.devices.trajectory import Trapezoid
+from robotcell.interfaces import JointWaypoint, LinearWaypoint
+from sim_twin.devices.arm_limits import STOP_DECELERATION_RAD_S2
+from sim_twin.devices.motion import plan_motion_stepwise
 from sim_twin.wire.shared_state import PERIOD_S
-from sim_twin.wire.ur.pose import displaced, pose_to_matrix
+from sim_twin.wire.ur.pose import pose_to_matrix
 from sim_twin.wire.ur.program import ScriptError, Thread
 from sim_twin.wire.ur.stops import stop_joints
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from robotcell.interfaces import Array
+    from robotcell.interfaces import Array, Waypoint
     from sim_twin.wire.ur.arm import Arm
 
 # A move that is slower than this [m/s, rad/s and per second] would never end.
 SLOWEST = 1e-5
+# Moves that are planned as one. The real controller looks ahead too; how far is not public.
+_MOST_BLENDED = 50
 
 
 @dataclass(frozen=True)
@@ -54,12 +57,12 @@ class Move:
 def follow(arm: Arm, moves: Iterable[Move], begin: Callable[[int], None] = lambda _: None) -> Thread:
     """Move along a path of moves.
 
-    Within its blend radius a move overlaps with the next one of its kind: their displacements add up, so the tool stays
-    inside the corner and both ends are met. Moves of different kinds meet at a standstill.
+    Within its blend radius a move gives way to the next one, of whatever kind, on the curve of
+    `robotcell.geometry.rounded_path`; at one without a radius the arm comes to a standstill.
 
     Args:
         arm: that moves.
-        moves: of the path, in order. A move is taken up when the one before it begins.
+        moves: of the path, in order. Those that blend are taken up together, the next ones when they have ended.
         begin: called with each move's number when it begins.
 
     Raises:
@@ -67,121 +70,67 @@ def follow(arm: Arm, moves: Iterable[Move], begin: Callable[[int], None] = lambd
     """
     yield from stop_joints(arm, STOP_DECELERATION_RAD_S2)
     waiting = iter(moves)
-    upcoming = next(waiting, None)
-    active: list[_JointLeg | _LineLeg] = []
-    q_end = arm.q
-    while upcoming is not None or active:
-        if upcoming is not None and (not active or (len(active) == 1 and active[0].may_blend(arm, upcoming))):
-            move, upcoming = upcoming, next(waiting, None)
-            # The blend ends by half way, so that a move has come to its own line before the next one begins.
-            leg = _leg(arm, move, q_end)
-            q_end = arm.waypoint = leg.q_goal
-            begin(move.number)
-            if leg.duration > 0:
-                active.append(leg)
-        if not active:
-            # A move that leads nowhere takes a period, so that a thousand of them cannot hold one up.
-            arm.rest()
-            yield
-            continue
-        for leg in active:
-            leg.t = min(leg.t + arm.rate * PERIOD_S, leg.duration)
-        arm.command(active[0].q_now(arm, active[1:]))
-        if active[0].t >= active[0].duration:
-            active.pop(0)
-        if not active and upcoming is None:
-            while not arm.arrives:
-                arm.rest()
-                yield
-                arm.command(arm.q)
-            arm.rest()
+    for first in waiting:
+        blended = [first]
+        while blended[-1].blend_m > 0 and len(blended) < _MOST_BLENDED:
+            following = next(waiting, None)
+            if following is None:
+                break
+            blended.append(following)
+        yield from _drive(arm, blended, begin)
+
+
+def _drive(arm: Arm, moves: Sequence[Move], begin: Callable[[int], None]) -> Thread:
+    """Move along moves that blend, from rest to rest."""
+    q, goals, waypoints = arm.q, [], []
+    for move in moves:
+        waypoint, q = _waypoint(arm, move, q)
+        goals.append(q)
+        waypoints.append(waypoint)
+    waypoints[-1] = replace(waypoints[-1], blend_m=0.0)
+    motion = yield from plan_motion_stepwise(arm.q, waypoints, arm.T_flange_tcp, PERIOD_S)
+    samples, begun, t, end = np.vstack([arm.q, motion.q]), 0, 0.0, float(len(motion.q))
+    while True:
+        t = min(t + arm.rate, end)
+        leg = int(motion.leg[math.ceil(t) - 1]) if t > 0 else 0
+        while begun <= (len(moves) - 1 if t >= end and not motion.breaks_off else leg):
+            arm.waypoint = goals[begun]
+            begin(moves[begun].number)
+            begun += 1
+        if moves[leg].straight and not arm.reachable:
+            # Says so.
+            arm.inverse(arm.forward(arm.q), arm.q)
+        k = min(int(t), max(len(samples) - 2, 0))
+        q = samples[k] if t == k else samples[k] + (t - k) * (samples[k + 1] - samples[k])
+        if t < end or not motion.breaks_off:
+            arm.command(q)
+        if t >= end:
+            break
         yield
+    if motion.breaks_off:
+        x, y, z = arm.forward(goals[begun - 1])[:3, 3]
+        raise ScriptError(
+            f"get_inverse_kin: cannot find a solution on the line to x {x:.4f}, y {y:.4f}, z {z:.4f} m: it leaves the "
+            "arm's reach, or passes too close to a singularity",
+            moves[begun - 1].line,
+        )
+    while not arm.arrives:
+        arm.rest()
+        yield
+        arm.command(arm.q)
+    arm.rest()
+    yield
 
 
-class _JointLeg:
-    """A move of the joints from `q_start`."""
-
-    straight = False
-
-    def __init__(self, q_start: Array, q_goal: Array, move: Move) -> None:
-        self.q_goal = q_goal
-        self.t = 0.0
-        self.way = q_goal - q_start
-        self._start = q_start
-        self._blend_m = move.blend_m
-        self._distance = float(np.abs(self.way).max())
-        self._profile = Trapezoid(self._distance, move.speed, move.acceleration) if self._distance > 0 else None
-        self.duration = self._profile.duration if self._profile else 0.0
-
-    def share(self) -> float:
-        """How much of the way is done."""
-        return _share(self._profile, self.t, self.duration)
-
-    def q_now(self, arm: Arm, others: Sequence[_JointLeg | _LineLeg]) -> Array:
-        """The target, with the displacement of a leg that has begun meanwhile."""
-        q = self.q_goal if self.t >= self.duration else self._start + self.share() * self.way
-        for leg in others:
-            assert isinstance(leg, _JointLeg)
-            q = q + leg.share() * leg.way
-        return q
-
-    def may_blend(self, arm: Arm, following: Move) -> bool:
-        """Whether the next move may begin."""
-        if self._blend_m <= 0 or following.straight or self.share() < 0.5:
-            return False
-        rest = arm.forward(self._start + self.share() * self.way)[:3, 3] - arm.forward(self.q_goal)[:3, 3]
-        return float(np.linalg.norm(rest)) <= self._blend_m
-
-
-class _LineLeg:
-    """A move of the tool on a line from where `q_start` puts it."""
-
-    straight = True
-
-    def __init__(self, arm: Arm, q_start: Array, T_goal: Array, q_goal: Array, move: Move) -> None:
-        self.q_goal = q_goal
-        self.t = 0.0
-        self._T_start, self._T_goal = arm.forward(q_start), T_goal
-        self.way = T_goal[:3, 3] - self._T_start[:3, 3]
-        self.turn = matrix_to_rotvec(T_goal[:3, :3] @ self._T_start[:3, :3].T)
-        self._blend_m = move.blend_m
-        length, turn = float(np.linalg.norm(self.way)), float(np.linalg.norm(self.turn))
-        distance = max(length, turn * ROTATION_LEVER_M)
-        if distance < 1e-9:
-            distance = 0.0
-        self._profile = Trapezoid(distance, move.speed, move.acceleration) if distance > 0 else None
-        self.duration = self._profile.duration if self._profile else 0.0
-
-    def share(self) -> float:
-        """How much of the way is done."""
-        return _share(self._profile, self.t, self.duration)
-
-    def q_now(self, arm: Arm, others: Sequence[_JointLeg | _LineLeg]) -> Array:
-        """The target, with the displacement of a leg that has begun meanwhile."""
-        if self.t >= self.duration:
-            T = self._T_goal
-        else:
-            T = displaced(self._T_start, self.share() * np.concatenate([self.way, self.turn]))
-        for leg in others:
-            assert isinstance(leg, _LineLeg)
-            T = displaced(T, leg.share() * np.concatenate([leg.way, leg.turn]))
-        return arm.inverse(T, arm.q)
-
-    def may_blend(self, arm: Arm, following: Move) -> bool:
-        """Whether the next move may begin."""
-        if self._blend_m <= 0 or not following.straight or self.share() < 0.5:
-            return False
-        return (1 - self.share()) * float(np.linalg.norm(self.way)) <= self._blend_m
-
-
-def _leg(arm: Arm, move: Move, q_start: Array) -> _JointLeg | _LineLeg:
+def _waypoint(arm: Arm, move: Move, q_start: Array) -> tuple[Waypoint, Array]:
+    """A move as the planner takes it, and the joint angles (6,) at its end."""
     try:
-        return _leg_of(arm, move, q_start)
+        return _waypoint_of(arm, move, q_start)
     except ScriptError as error:
         raise ScriptError(str(error), move.line) from None
 
 
-def _leg_of(arm: Arm, move: Move, q_start: Array) -> _JointLeg | _LineLeg:
+def _waypoint_of(arm: Arm, move: Move, q_start: Array) -> tuple[Waypoint, Array]:
     if not (move.speed >= SLOWEST and move.acceleration >= SLOWEST):
         raise ScriptError(f"move: speed and acceleration must be at least {SLOWEST:g}")
     if move.is_pose:
@@ -192,12 +141,7 @@ def _leg_of(arm: Arm, move: Move, q_start: Array) -> _JointLeg | _LineLeg:
         if not (np.abs(q_goal) <= ur5e.JOINT_LIMIT).all():
             raise ScriptError(f"move: {np.round(q_goal, 3).tolist()} is outside the joint limits")
         T_goal = arm.forward(q_goal)
+    blend_m = max(move.blend_m, 0.0)
     if move.straight:
-        return _LineLeg(arm, q_start, T_goal, q_goal, move)
-    return _JointLeg(q_start, q_goal, move)
-
-
-def _share(profile: Trapezoid | None, t: float, duration: float) -> float:
-    if profile is None or t >= duration:
-        return 1.0
-    return float(profile.position(t)) / profile.distance
+        return LinearWaypoint(T_goal, move.speed, move.acceleration, blend_m), q_goal
+    return JointWaypoint(q_goal, move.speed, move.acceleration, blend_m), q_goal

@@ -29,6 +29,9 @@ MAX_LINE_BYTES = 2048
 # A secondary program runs within one period.
 MAX_SECONDARY_STATEMENTS = 20
 
+# Without and with FLAG_UPPER_RANGE_REGISTERS.
+REGISTER_OFFSETS = (0, 24)
+
 COMMANDS = frozenset({"power on", "power off", "set robotmode run", "set unlock protective stop", "stop program"})
 
 _STRING = re.compile(r"\"[^\"]*\"|'[^']*'")
@@ -243,18 +246,24 @@ class _Block:
         if self._given_up:
             return None
         if self._is_control:
-            if self._path_error is not None:
-                return self._refuse(self._path_error)
-            return ControlScript(max(self._offset or 0, 0), tuple(self._path))
-        if self._error is not None:
-            return self._refuse(self._error)
-        kind, name = _HEADER.match(self.header).groups()  # type: ignore[union-attr]
-        secondary = kind == "sec"
+            return self._complete_control_script()
+        header = _HEADER.match(self.header)
+        if self._error is not None or header is None:
+            return self._refuse(self._error or not_understood(self.header, 1))
+        secondary = header[1] == "sec"
         if secondary and len(self._lines) > MAX_SECONDARY_STATEMENTS:
             return self._refuse(
                 ScriptError(f"a secondary program of more than {MAX_SECONDARY_STATEMENTS} statements is not taken")
             )
-        return Script(name, tuple(self._lines), secondary)
+        return Script(header[2], tuple(self._lines), secondary)
+
+    def _complete_control_script(self) -> Received:
+        if self._path_error is not None:
+            return self._refuse(self._path_error)
+        offset = max(self._offset or 0, 0)
+        if offset not in REGISTER_OFFSETS:
+            return self._refuse(ScriptError(f"a register offset of {offset}; the client has 0 and 24"))
+        return ControlScript(offset, tuple(self._path))
 
     def _refuse(self, error: ScriptError) -> Refused:
         return Refused(error, secondary=re.match(r"sec\b", self.header) is not None)

@@ -63,8 +63,6 @@ _MAX_LAG_S = 0.02
 # Of a period, at most so much is spent on what clients have sent; the system takes the processor away from a process of
 # real-time priority that leaves less than 5 % of it.
 _SHARE = 0.25
-# Carried out in a period even where there is no time left, so that a controller that is late does not grow deaf.
-_LEAST_STEPS = 20
 _REPORTS_PER_PERIOD = 8
 _STATE_TICKS = round(STATE_PERIOD_S / PERIOD_S)
 # A header that says less than its own length; a data package without data; a line that is no word of the dashboard.
@@ -225,10 +223,9 @@ class _Server:
         """Serve the sockets until a time, at least once."""
         for port in (self._rtde, self._dashboard, self._script):
             self._follow_fault(port)
-        until, least = time.monotonic() + _SHARE * PERIOD_S, _LEAST_STEPS
+        until = time.monotonic() + _SHARE * PERIOD_S
         while True:
-            self._obey(until, least)
-            least = 0
+            self._obey(until)
             readers: dict[Any, tuple[Port, Client | None]] = {}
             for port in self._ports:
                 if port.listener is not None:
@@ -250,18 +247,14 @@ class _Server:
             if time.monotonic() >= deadline or not ready:
                 return
 
-    def _obey(self, until: float, least: int) -> None:
-        """Carry out what clients have sent, each client a message in turn, until a time, but at least so many.
+    def _obey(self, until: float) -> None:
+        """Carry out what clients have sent, each client a message in turn, until a time.
 
         However much a client sends, and however long it takes to read, the period is kept, and the processor is left to
         others for a part of it.
         """
-        done = 0
         turns = deque(item for item in self._waiting.items() if not self._stuck(item[1]))
-        while turns:
-            if done >= least and time.monotonic() >= until:
-                return
-            done += 1
+        while turns and time.monotonic() < until:
             client, port = turns.popleft()
             if client in self._waiting and self._step(port, client):
                 turns.append((client, port))

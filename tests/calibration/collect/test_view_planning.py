@@ -61,8 +61,8 @@ def test_every_way_is_safe_and_keeps_the_board_over_what_may_stand_on_the_table(
 
 
 def test_a_seed_plans_the_same_views_again_and_another_plans_others():
-    again, other = plan(count=2), plan(count=2, seed=2)
-    np.testing.assert_array_equal(again.views, plan(count=2).views)
+    first, again, other = plan(count=1), plan(count=1), plan(count=1, seed=2)
+    np.testing.assert_array_equal(again.views, first.views)
     assert not np.array_equal(again.views, other.views)
 
 

@@ -59,8 +59,9 @@ def write(path: Path, series: Series, header: str = "t,x,y,z,qx,qy,qz,qw\n") -> 
     return path
 
 
-@pytest.mark.parametrize("mount", ["fixed", "flange"])
-@pytest.mark.parametrize(("offset", "stops"), [(0.05, False), (-0.037, True), (1234.5678, False)])
+@pytest.mark.parametrize(
+    ("mount", "offset", "stops"), [("flange", 0.05, False), ("fixed", -0.037, True), ("fixed", 1234.5678, False)]
+)
 def test_offset_and_camera_are_found(mount: str, offset: float, stops: bool) -> None:
     solution = solve_series(*recording(mount, offset, stops=stops), mount)
     assert solution.accepted, solution.verdict.words

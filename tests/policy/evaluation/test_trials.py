@@ -40,7 +40,7 @@ def test_a_trial_is_the_job_that_its_command_runs(tmp_path):
 def test_a_cell_that_stops_is_a_result_with_its_picture(tmp_path):
     (tmp_path / "one.toml").write_text(toml(("goal", '"red"')))
     case = Case("one.toml", str(tmp_path / "one.toml"), "red")
-    result, pictures = run_trial(trial(case, limits__force_n=1.0))
+    result, pictures = run_trial(trial(case, limits__force_n=1.0, motion__contact_force_n=1.0))
     assert not result.completed
     assert not result.true_completed
     assert result.failures == {"stopped": 1}
@@ -73,7 +73,7 @@ def test_a_goal_that_is_not_there_is_shown_as_the_table_at_the_end(tmp_path):
 def test_a_drawn_scene_whose_goal_lies_buried_is_drawn_anew():
     case = SUITES["random"].cases[0]
     # Under the heap of seed 0 no red is seen. The limit ends the job at the first contact.
-    result, _ = run_trial(trial(case, 0, limits__force_n=1.0))
+    result, _ = run_trial(trial(case, 0, limits__force_n=1.0, motion__contact_force_n=1.0))
     assert result.seed == 0
     assert result.scene_seed == 1_000_000
     assert "--seed 1000000" in result.command
@@ -82,9 +82,11 @@ def test_a_drawn_scene_whose_goal_lies_buried_is_drawn_anew():
 
 def test_of_many_failures_the_first_two_and_the_last_are_shown(tmp_path):
     (tmp_path / "one.toml").write_text(toml(("goal", '"red"')))
-    # Nothing is wide enough to count as held.
+    # Whatever is tried is refused: the arm is kept out of where the goal stands.
+    shelf = {"name": "shelf", "x": (-0.65, -0.35), "y": (-0.15, 0.15), "z": (0.0, 0.15)}
     case = Case("one.toml", str(tmp_path / "one.toml"), "red")
-    result, pictures = run_trial(trial(case, gripper__empty_width_m=0.05, gripper__preshape_m=0.055))
+    result, pictures = run_trial(trial(case, keep_out=[shelf]))
+    assert set(result.failures) == {"refused"}
     assert sum(result.failures.values()) > 3
     assert [failure.action.split(".")[0] for failure in result.shown][:2] == ["1", "2"]
     assert int(result.shown[2].action.split(".")[0]) > 3

@@ -14,7 +14,7 @@ from robotcell.errors import ConfigError
 from tests.robotcell.maps import heightmap
 
 CONFIG = CellConfig()
-GRIPPER = OpenGripper(CONFIG.gripper.preshape_m, CONFIG.gripper.tip_clearance_m)
+GRIPPER = OpenGripper.of(CONFIG)
 STAYS = PushOutcome({}, frozenset())
 
 

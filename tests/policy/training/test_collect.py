@@ -50,9 +50,11 @@ def test_only_pushes_lead_on_and_only_within_their_scene(shard):
 
 
 def test_a_scene_gives_the_same_wherever_it_is_played(shard):
-    again = play(SEEDS)
+    alone = play(SEEDS[:1])
+    assert 0 < len(alone.state) < len(shard.state)
     for field in fields(Shard):
-        assert np.array_equal(getattr(again, field.name), getattr(shard, field.name)), field.name
+        again = getattr(alone, field.name)
+        assert np.array_equal(again, getattr(shard, field.name)[: len(again)]), field.name
 
 
 def test_a_shard_comes_back_from_its_file(shard, tmp_path):

@@ -275,7 +275,7 @@ def toy_replay() -> Replay:
 
 def test_it_learns_what_the_picture_tells() -> None:
     """Across and along a bar, in scenes that it was never trained on."""
-    replay, updates = toy_replay(), 120
+    replay, updates = toy_replay(), 64
     settings = LearningSettings(learning_rate=3e-3)
     learner = Learner(QNetwork(), settings, stage=1, planned_updates=updates, seed=0, crop_cells=SMALL_CROP)
     assert 0.3 < learner.validate(replay, 400)["grasp_auc"] < 0.7

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 from robotcell.config import load_config
 from sim_twin.wire.cell import ServedCell
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-HOST, MODBUS_PORT, CAMERA_PORT = "127.0.0.45", 15045, 30445
+HOST, MODBUS_PORT, CAMERA_PORT = loopback(45), 15045, 30445
 # One cube in the middle of the workspace, for the gripper to feel.
 _SCENE = """
 name = "one cube"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from robotcell.cell import open_cell
-from robotcell.config import load_config
+from robotcell.config import find_backend, load_config
 from robotcell.drivers.clock import WallClock
 from robotcell.errors import ConfigError, ConnectionLost
 
@@ -24,6 +24,17 @@ def test_the_examples_open(name: str) -> None:
         with pytest.raises(ConnectionLost):
             call()
     cell.close()
+
+
+def test_a_cell_is_named_by_the_address_of_its_arm_whichever_name_the_file_uses() -> None:
+    def name(host: str) -> str | None:
+        config = load_config(EXAMPLES / "wire.toml", {"backend.options.arm.host": host})
+        return find_backend("hardware").cell_name(config)
+
+    assert name("localhost") == name("127.0.0.1") == name("127.1") == "arm-127.0.0.1"
+    assert name("127.0.0.2") != name("127.0.0.1")
+    assert name("Nowhere.invalid") == "arm-nowhere.invalid"
+    assert find_backend("twin").cell_name(load_config()) is None
 
 
 def test_options_of_the_twin_are_refused() -> None:

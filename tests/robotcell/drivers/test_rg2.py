@@ -16,6 +16,7 @@ from robotcell.drivers.clock import WallClock
 from robotcell.drivers.rg2 import RG2, RG2Options
 from robotcell.errors import ConfigError, ConnectionLost, DeviceFault, UnsafeMotion
 from sim_twin.wire.faults import Fault, Kind
+from tests.addresses import loopback
 from tests.robotcell.drivers.served_cell import HOST, MODBUS_PORT
 from tests.sim_twin.cells import joints_at, tool_down
 
@@ -168,7 +169,7 @@ def test_a_second_client_is_told_why_it_is_not_served(options, gripper):
 def test_nobody_there(options):
     began = time.monotonic()
     with pytest.raises(ConnectionLost, match="nothing answers"):
-        RG2(options.model_copy(update={"host": "127.0.0.27"}), WallClock()).connect()
+        RG2(options.model_copy(update={"host": loopback(27)}), WallClock()).connect()
     assert time.monotonic() - began < BOUND_S
 
 
@@ -328,7 +329,7 @@ def test_a_grip_bit_at_the_commanded_width_is_no_grip(served, options):
 @contextmanager
 def box_with(product):
     """A Compute Box that tells the code of the device behind it, and nothing else; where it listens."""
-    with socket.create_server(("127.0.0.28", 0)) as server:
+    with socket.create_server((loopback(28), 0)) as server:
 
         def serve():
             connection, _ = server.accept()

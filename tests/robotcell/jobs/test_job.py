@@ -25,11 +25,13 @@ from robotcell.perception.colors import PALETTE
 from robotcell.perception.goals import find_goal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from robotcell.findings import Finding
     from robotcell.interfaces import Camera, Gripper, GripperState, RgbdFrame
     from robotcell.jobs.decision import Decision
+    from robotcell.motion.plan import MotionPlan
     from robotcell.perception.view import View
 
 SCENE = """
@@ -50,11 +52,15 @@ position = [0.0, -0.06, 0.025]
 """
 
 
+# A job is the same however fast the arm gets to where it acts, and half of a job here is motion through free space.
+BRISK = {"motion.joint_acceleration_rad_s2": 4.0, "motion.linear_acceleration_m_s2": 4.0}
+
+
 @pytest.fixture
 def config(tmp_path: Path) -> CellConfig:
     scene = tmp_path / "two-cubes.toml"
     scene.write_text(SCENE)
-    return load_config(None, {"backend.options.scene": str(scene), "journal.runs": str(tmp_path / "runs")})
+    return load_config(None, {"backend.options.scene": str(scene), "journal.runs": str(tmp_path / "runs"), **BRISK})
 
 
 @dataclass
@@ -93,6 +99,8 @@ def run(
     class Collector:
         def started(self, job_id: int, run_dir: Path) -> None: ...
 
+        def checked(self, findings: Sequence[Finding]) -> None: ...
+
         def looked(self, view: View) -> None: ...
 
         def decided(self, decision: Decision) -> None: ...
@@ -123,9 +131,10 @@ def test_what_was_decided_and_felt_is_in_the_journal(config: CellConfig) -> None
     assert (grasp.primitive, grasp.surface_m, grasp.end_x) == ("grasp", 0.05, None)
     for row in (push, grasp):
         assert row.outcome is not None
-        # The fingers moved in both, and what they pressed with is known, though nothing ended the plan.
-        assert row.outcome.grip_force_n is not None
+        # What was felt is known, though nothing ended the plan. A push closes the fingers in free air.
         assert row.outcome.peak_force_n is not None
+    assert push.outcome is not None
+    assert push.outcome.grip_force_n is None
     assert grasp.outcome is not None
     assert 0 < (grasp.outcome.grip_force_n or 0) < config.motion.closing_force_n
 
@@ -136,6 +145,16 @@ def test_a_policy_sees_the_map_that_it_declares_and_people_the_one_of_the_file(c
     report, results, _ = run(coarse, policy, ("red",))
     assert results == [Result.PICKED], report.reason
     assert policy.seen[0].heightmap.workspace.resolution_m == 0.003
+
+
+@pytest.mark.parametrize(("offset", "preshape"), [(0.02, 0.07), (-0.005, 0.08)])
+def test_fingers_with_other_tips_pick(config: CellConfig, offset: float, preshape: float) -> None:
+    config.backend.options["fingertip_offset_m"] = offset
+    config = config.model_copy(update={"gripper": config.gripper.model_copy(update={"preshape_m": preshape})})
+    policy = Scripted([grasp_at(-0.4, 0.0), grasp_at(*RED)])
+    report, results, _ = run(config, policy, ("red",))
+    # Fingers that close on nothing know it, however far apart their tips then are.
+    assert results == [Result.MISSED, Result.PICKED], report.reason
 
 
 def test_a_wrong_object_counts_as_wrong(config: CellConfig) -> None:
@@ -183,6 +202,27 @@ def test_an_unsafe_action_is_refused_and_nothing_moves(config: CellConfig) -> No
     assert row.outcome is not None
     assert row.outcome.result == "refused"
     assert "cannot reach" in row.outcome.detail
+
+
+def test_an_action_that_somebody_declines_is_barred_and_another_one_decided(config: CellConfig) -> None:
+    # More than the failures that end a job: a no is none.
+    policy = Scripted([grasp_at(-0.4, 0.01 * i) for i in range(12)] + [grasp_at(*RED)])
+    asked: list[tuple[Decision, MotionPlan]] = []
+    with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
+        q = cell.arm.state().q
+
+        def confirm(decision: Decision, plan: MotionPlan) -> bool:
+            np.testing.assert_allclose(cell.arm.state().q, q, atol=1e-3)
+            asked.append((decision, plan))
+            return len(asked) > 12
+
+        report = run_job(cell, policy, journal, ("red",), confirm=confirm)
+        rows = journal.job(report.job_id).actions
+    assert report.completed
+    assert [row.outcome.result for row in rows if row.outcome] == ["declined"] * 12 + ["picked"]
+    assert [len(observation.barred) for observation in policy.seen] == list(range(13))
+    assert report.metrics.actions == 1
+    assert asked[-1][1].steps[0].label == "pre-shape"
 
 
 def test_ten_failures_in_a_row_end_the_run(config: CellConfig) -> None:
@@ -305,7 +345,7 @@ def test_a_goal_that_was_lost_on_its_way_is_not_searched_for(config: CellConfig)
 
 
 def test_two_looks_at_an_untouched_heap_show_no_push() -> None:
-    crowded = load_config(None, {"backend.options.objects": 30, "backend.options.seed": 1})
+    crowded = load_config(None, {"backend.options.objects": 20, "backend.options.seed": 1})
     with open_cell(crowded) as cell:
         view = cell.look()
         push = Push((-0.72, -0.22), (-0.62, -0.22), 0, 0.05, 1.0)

@@ -10,9 +10,21 @@ from hypothesis import strategies as st
 from robotcell.config import CellConfig
 from robotcell.errors import UnsafeMotion
 from robotcell.geometry import rg2, ur5e
+from robotcell.geometry.bodies import blocks_view
 from robotcell.motion.actions import plan_action
-from robotcell.motion.grasp import LOAD_REACH_M
-from robotcell.motion.plan import Grip, JointMove, LinearMove, MotionPlan
+from robotcell.motion.grasp import HELD_AFTER_LIFT, LOAD_REACH_M
+from robotcell.motion.path_check import check_path
+from robotcell.motion.plan import (
+    Grip,
+    JointMove,
+    LinearMove,
+    MotionPlan,
+    Shape,
+    Step,
+    blended,
+    guarded_move,
+    joint_move,
+)
 from robotcell.motion.tool import TALLEST_OBJECT_M
 from tests.robotcell.maps import KINDS, action, heightmap
 
@@ -85,7 +97,7 @@ def test_a_push_goes_straight_and_stays_in_the_workspace(x: float, y: float, rot
     for T in (start, end):
         assert CONFIG.workspace.x[0] - 1e-6 <= T[0, 3] <= CONFIG.workspace.x[1] + 1e-6
         assert CONFIG.workspace.y[0] - 1e-6 <= T[1, 3] <= CONFIG.workspace.y[1] + 1e-6
-    (grip,) = (step for step in plan.steps if isinstance(step, Grip))
+    (grip,) = (step for step in plan.steps if isinstance(step, Shape))
     assert grip.width_m == 0.0
 
 
@@ -99,12 +111,50 @@ def test_what_is_picked_is_let_go_well_inside_the_bin(x: float, y: float, rotati
     assert tcp[2] > CONFIG.bin.wall_height_m + 0.1
 
 
-def test_every_plan_ends_at_home() -> None:
+def test_every_plan_ends_where_the_camera_sees_the_workspace() -> None:
+    eye = CONFIG.camera.pose()[:3, 3]
     for kind in KINDS:
         plan = plan_action(action(kind, -0.5, 0.0, 0.05, 3), heightmap(), HOME, CONFIG)
-        last = plan.steps[-1]
-        assert isinstance(last, JointMove)
-        np.testing.assert_array_equal(last.q, HOME)
+        last = [step for step in plan.steps if isinstance(step, JointMove)][-1]
+        space = CONFIG.workspace
+        assert not blocks_view(last.q, eye, space.x, space.y, CONFIG.table.height_m, LOAD_REACH_M)
+
+
+@given(xs, ys, rotations, rotations)
+def test_from_over_the_bin_as_from_home_the_way_of_the_leading_joint_is_short(
+    x: float, y: float, rotation: int, next_rotation: int
+) -> None:
+    plan = plan_action(action("grasp", x, y, 0.05, rotation), heightmap(), HOME, CONFIG)
+    approach, carry = (step for step in plan.steps if isinstance(step, JointMove))
+    (following, _) = (
+        step
+        for step in plan_action(action("grasp", x, y, 0.05, next_rotation), heightmap(), carry.q, CONFIG).steps
+        if isinstance(step, JointMove)
+    )
+    # The jaw is symmetric: no joint turns by more than half a turn and what lies between the places.
+    for q, q_next in ((HOME, approach.q), (approach.q, carry.q), (carry.q, following.q)):
+        assert np.abs(q - q_next).max() < 0.6 * np.pi
+
+
+def test_motions_that_touch_nothing_are_blended_and_all_others_come_to_rest() -> None:
+    plan = plan_action(action("grasp", -0.5, 0.0, 0.05, 3), heightmap(), HOME, CONFIG)
+    labels = [[plan.steps[i].label for i in group] for group in blended(plan.steps)]
+    assert ["approach", "descend"] in labels
+    assert ["lift", HELD_AFTER_LIFT, "carry to bin"] in labels
+    assert ["descend guarded"] in labels
+    assert ["close"] in labels
+
+
+@pytest.mark.parametrize("after", ["guarded", "grip", "nothing"])
+def test_a_motion_is_blended_with_free_motions_only(after: str) -> None:
+    T = ur5e.forward(HOME) @ rg2.T_FLANGE_TCP
+    steps: list[Step] = [joint_move("first", HOME, CONFIG, blend_m=0.02)]
+    if after == "guarded":
+        steps.append(guarded_move("second", T, CONFIG, 0.1))
+    elif after == "grip":
+        steps.append(Grip("second", 0.02, 20.0))
+    with pytest.raises(UnsafeMotion, match="cannot be blended"):
+        check_path(MotionPlan("test", HOME, tuple(steps)), CONFIG)
 
 
 def test_a_target_out_of_reach_is_refused() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotcell.config import Workspace
@@ -36,6 +36,7 @@ def seen(plane_m: float) -> np.ndarray:
     return np.asarray((plane_m - T_BASE_CAMERA[2, 3]) / rays[2])
 
 
+@settings(max_examples=30)
 @given(st.floats(-0.7, -0.3), st.floats(-0.2, 0.2), st.floats(0.0, 0.1))
 def test_a_point_lies_on_the_ray_of_the_pixel_that_it_is_projected_to(x: float, y: float, z: float) -> None:
     for camera in (CalibratedCamera(T_BASE_CAMERA), CalibratedCamera(T_BASE_CAMERA, TRUE)):

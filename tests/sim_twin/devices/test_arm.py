@@ -75,7 +75,7 @@ def test_a_hard_collision_stops_the_arm_until_it_is_recovered(cell):
 
 
 def test_a_motion_faster_than_the_motors_allow_ends_in_a_protective_stop(cell):
-    cell.arm.start_joints(joints_at(tool_down(-0.65, 0.10, 0.35)), 1.5, 1.4)
+    cell.arm.start_joints(np.array((-0.3, -0.6, 0.1, -1.0, -1.57, 1.3)), 1.5, 1.4)
     finish(cell)
     # Raising the stretched arm at 40 rad/s^2 takes more than the shoulder's 150 N m.
     cell.arm.start_joints(cell.arm.state().q + np.array((0, -0.8, 0, 0, 0, 0)), 3.14, 40.0)

@@ -91,6 +91,7 @@ class TremblingWorld:
     """Fingers that are stopped at 48 mm and tremble there by a quarter of a millimetre in every step."""
 
     time_s = 0.0
+    gripper_range = rg2.range_with_tips(0.0)
 
     def __init__(self):
         self.controllers = []

@@ -2,7 +2,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
@@ -284,6 +284,7 @@ def test_garbage_toml_is_never_more_than_a_config_error(tmp_path_factory, text):
 entries = st.lists(st.tuples(st.sampled_from(BLOCK_NAMES), colors, positions, triples), min_size=1, max_size=6)
 
 
+@settings(max_examples=40)
 @given(items=entries, drop=st.booleans())
 def test_a_toml_scene_says_what_was_written(tmp_path_factory, items, drop):
     lines = ['name = "made"', f"drop = {str(drop).lower()}"]

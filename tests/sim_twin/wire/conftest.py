@@ -9,11 +9,12 @@ import pytest
 
 from robotcell.config import load_config
 from sim_twin.wire.cell import ServedCell
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-HOST = "127.0.0.23"
+HOST = loopback(23)
 ONE = load_config(None, {"backend.options.objects": 1})
 
 

@@ -12,6 +12,7 @@ from pymodbus.client import ModbusTcpClient
 from robotcell.errors import ConfigError, ConnectionLost
 from sim_twin.wire.cell import ServedCell
 from sim_twin.wire.faults import Fault, Kind
+from tests.addresses import loopback
 from tests.processes import all_end
 from tests.sim_twin.wire.conftest import HOST, ONE
 
@@ -22,7 +23,7 @@ import sys
 from robotcell.config import load_config
 from sim_twin.wire.cell import ServedCell
 if __name__ == "__main__":
-    with ServedCell(load_config(None, {"backend.options.objects": 1}), "127.0.0.24", 0, 0) as cell:
+    with ServedCell(load_config(None, {"backend.options.objects": 1}), "HOST", 0, 0) as cell:
         print(*cell.processes.values(), flush=True)
         sys.stdin.read()
 """
@@ -60,7 +61,7 @@ def test_a_stop_directly_followed_by_a_grip_moves_the_fingers(served):
 
 
 def test_a_port_that_is_taken_is_named():
-    host = "127.0.0.28"
+    host = loopback(28)
     with socket.create_server((host, 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(ConfigError, match=f"{host}:{port}"):
@@ -101,7 +102,7 @@ def test_a_cell_that_is_not_served_has_no_state():
 
 
 def test_a_server_that_was_killed_is_missed_and_leaves_nothing():
-    cell = ServedCell(ONE, "127.0.0.25", modbus_port=0, camera_port=0)
+    cell = ServedCell(ONE, loopback(25), modbus_port=0, camera_port=0)
     with cell:
         names = cell.shared_memory
         assert len(names) == 4
@@ -119,7 +120,7 @@ def test_a_server_that_was_killed_is_missed_and_leaves_nothing():
 
 def test_no_server_outlives_a_supervisor_that_was_killed(tmp_path):
     script = tmp_path / "supervisor.py"
-    script.write_text(SUPERVISOR, encoding="utf-8")
+    script.write_text(SUPERVISOR.replace("HOST", loopback(24)), encoding="utf-8")
     supervisor = subprocess.Popen(
         [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     )

@@ -3,9 +3,11 @@ import json
 import socket
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from robotcell.errors import ConfigError, ConnectionLost
-from sim_twin.wire.control import ControlSocket
+from sim_twin.wire.control import ControlSocket, handle
 from sim_twin.wire.control_client import ask
 from tests.sim_twin.wire.conftest import HOST
 
@@ -55,6 +57,31 @@ def test_it_says_what_is_wrong(control, line, words):
     answer = answer_to(control.endpoint, line)
     assert not answer["ok"]
     assert words in answer["error"]
+
+
+WORDS = st.sampled_from(
+    [
+        b'{"inject": ',
+        b'{"clear": ',
+        b'{"list": ',
+        b"{",
+        b"}",
+        b"[",
+        b"]",
+        b"true",
+        b'"device": "arm"',
+        b'"kind": "off"',
+        b"1e999",
+    ]
+)
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.one_of(st.binary(max_size=60), st.lists(WORDS, max_size=6).map(b"".join)))
+def test_any_line_gets_an_answer(served, line):
+    answer = handle(line, served)
+    assert answer["ok"] or answer["error"]
+    assert json.loads(json.dumps(answer)) == answer
 
 
 def test_it_hangs_up_on_a_flood_and_lives_on(control):

@@ -11,12 +11,14 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
+from robotcell.cell import open_cell
 from robotcell.config import load_config
 from robotcell.drivers.doctor.examine import examine
-from robotcell.drivers.doctor.findings import Finding, Grade
 from robotcell.errors import ConfigError
+from robotcell.findings import Finding, Grade
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.robotcell.drivers.served_cell import CAMERA_PORT, HOST, MODBUS_PORT
 from tests.robotcell.drivers.ur5e.served_arm import fault, joints, make_arm, wait_until
 
@@ -47,7 +49,7 @@ def cell_text(host: str) -> str:
 @pytest.fixture
 def cell_file(tmp_path: Path) -> Path:
     path = tmp_path / "cell.toml"
-    path.write_text(cell_text(HOST))
+    path.write_text(f'{cell_text(HOST)}[journal]\nruns = "{tmp_path / "runs"}"\n')
     return path
 
 
@@ -62,7 +64,7 @@ def wrong(findings: list[Finding]) -> list[Finding]:
 
 def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> None:
     path = tmp_path / "absent.toml"
-    path.write_text(cell_text("127.0.0.49"))
+    path.write_text(cell_text(loopback(49)))
     begin = time.monotonic()
     result = CliRunner().invoke(app, ["doctor", "--cell", str(path), "--json", "--seconds", "0.5"])
     assert time.monotonic() - begin < 10.0
@@ -73,12 +75,24 @@ def test_with_nothing_there_each_device_says_what_is_missing(tmp_path: Path) -> 
     assert set(absent) == {"arm", "gripper", "camera"}
     assert "check that the controller has booted" in absent["arm"]
     assert "check the Compute Box's power" in absent["gripper"]
-    assert "127.0.0.49" in absent["camera"]
+    assert loopback(49) in absent["camera"]
+
+
+def test_finger_tips_that_cannot_reach_the_preshape_are_refused(served: ServedCell, tmp_path: Path) -> None:
+    path = tmp_path / "tips.toml"
+    path.write_text(cell_text(HOST).replace("port =", "fingertip_offset_m = 0.02\nport ="))
+    for command in (["doctor", "--seconds", "0.5"], ["pick", "--all", "--dry-run"], ["pick", "--all"]):
+        result = CliRunner().invoke(app, [*command, "--cell", str(path), "--json"])
+        assert result.exit_code == (3 if command[0] == "doctor" else 2)
+        assert "gripper.preshape_m = 0.08: outside" in result.stdout
+    # From Python, the cell does not open.
+    with pytest.raises(ConfigError, match="to 70 mm"), open_cell(load_config(path)):
+        pytest.fail("it opened")
 
 
 def test_a_usb_camera_needs_its_rule_and_is_looked_for(tmp_path: Path) -> None:
     path = tmp_path / "usb.toml"
-    path.write_text(cell_text("127.0.0.49").replace(f"twin://127.0.0.49:{CAMERA_PORT}", "usb"))
+    path.write_text(cell_text(loopback(49)).replace(f"twin://{loopback(49)}:{CAMERA_PORT}", "usb"))
     findings = examine(load_config(path), SECONDS)
     assert any(finding.what == "udev rule" for finding in findings)
     assert any(finding.device == "camera" and "no RealSense" in finding.cure for finding in wrong(findings))
@@ -124,12 +138,18 @@ def test_recover_asks_first_and_then_leaves_the_stop(served: ServedCell, cell_fi
         served.inject(fault("state", Kind.WRONG, "program_paused"))
         wait_until(lambda: arm.state().mode is ArmMode.NOT_READY)
         runner = CliRunner()
-        refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input="n\n")
-        assert refused.exit_code == 3
-        assert arm.state().mode is ArmMode.NOT_READY
+        for answer in ("n\n", ""):
+            refused = runner.invoke(app, ["recover", "--cell", str(cell_file)], input=answer)
+            assert refused.exit_code == 3
+            assert "nothing moved" in refused.stderr
+            assert arm.state().mode is ArmMode.NOT_READY
     left = runner.invoke(app, ["recover", "--cell", str(cell_file), "--yes"])
     assert left.exit_code == 0, left.output
-    assert "ready" in left.output
+    assert "a device is stopped" in left.stderr
+    assert "the arm is ready, and no stop stands" in left.stdout
+    again = runner.invoke(app, ["recover", "--cell", str(cell_file), "--yes"])
+    assert again.exit_code == 0, again.output
+    assert "nothing to recover from" in again.stdout
     with make_arm() as arm:
         assert arm.state().mode is ArmMode.READY
 

@@ -12,6 +12,7 @@ from robotcell.drivers.ur5e.child_process import ChildProcess
 from robotcell.drivers.ur5e.clock_offset import ClockOffset
 from robotcell.drivers.ur5e.messages import Setup
 from robotcell.errors import ConnectionLost, StorageError
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,7 +28,7 @@ def test_a_disk_that_takes_no_file_is_a_storage_error(tmp_path: Path, monkeypatc
 def test_a_child_that_cannot_connect_ends_and_says_why() -> None:
     child = ChildProcess.start()
     try:
-        setup = Setup("127.0.0.43", control=True, tcp_offset=(0.0,) * 6, payload_kg=0.0, payload_cog=(0.0,) * 3)
+        setup = Setup(loopback(43), control=True, tcp_offset=(0.0,) * 6, payload_kg=0.0, payload_cog=(0.0,) * 3)
         with pytest.raises(ConnectionLost, match="ended with code 1"):
             child.ask(setup)
         with pytest.raises(ConnectionLost, match="ended with code 1"):

@@ -14,13 +14,16 @@ import pytest
 from robotcell.drivers.clock import WallClock
 from robotcell.drivers.ur5e.arm import UR5e, UR5eOptions
 from robotcell.drivers.ur5e.controller import Controller, arm_mode, inspect, obstacles
+from robotcell.drivers.ur5e.controller_findings import controller_findings, tool_findings
 from robotcell.errors import ConnectionLost
+from robotcell.findings import Grade
 from robotcell.interfaces import ArmMode
+from tests.addresses import loopback
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-HOST = "127.0.0.41"
+HOST = loopback(41)
 PORTS = (30004, 30003, 29999)
 READY = Controller(
     version=(5, 12, 6, 1),
@@ -162,3 +165,24 @@ def test_the_mode_is_ready_only_when_everything_is(
 def test_inspection_needs_every_port() -> None:
     with pytest.raises(ConnectionLost, match="30004"):
         inspect(HOST)
+
+
+def test_a_tool_that_somebody_changed_is_wrong_and_one_that_is_yet_to_be_set_is_noted() -> None:
+    changed = replace(READY, payload_kg=2.0, tcp_offset=(0.0, 0.0, 0.15, 0.0, 0.0, 0.0))
+    for set_by_us, grade in ((True, Grade.WRONG), (False, Grade.NOTE)):
+        found = list(tool_findings(changed, READY.payload_kg, READY.payload_cog, changed=set_by_us))
+        assert {finding.what: finding.grade for finding in found} == {
+            "TCP [m, rad]": grade,
+            "payload [kg]": grade,
+            "payload's centre [m]": Grade.OK,
+        }
+        assert all(("0.78" in finding.cure) == (finding.what == "payload [kg]") for finding in found)
+
+
+def test_a_slow_slider_is_noted_and_one_that_stands_still_is_wrong() -> None:
+    def grades(fraction: float) -> set[Grade]:
+        return {finding.grade for finding in controller_findings(replace(READY, speed_fraction=fraction))}
+
+    assert grades(1.0) == {Grade.OK}
+    assert grades(0.5) == {Grade.OK, Grade.NOTE}
+    assert Grade.WRONG in grades(0.01)

@@ -20,6 +20,7 @@ from robotcell.errors import ConnectionLost, DeviceFault
 from robotcell.geometry import rg2
 from robotcell.interfaces import ArmMode
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.robotcell.drivers.served_cell import HOST, serve
 from tests.robotcell.drivers.ur5e.served_arm import (
     LOST_S,
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from robotcell.drivers.ur5e.arm import UR5e
     from sim_twin.wire.cell import ServedCell
 
-SECOND_HOST, SECOND_PORTS = "127.0.0.44", (15044, 30444)
+SECOND_HOST, SECOND_PORTS = loopback(44), (15044, 30444)
 
 
 @pytest.fixture
@@ -126,9 +127,11 @@ def test_the_arm_stands_when_our_own_process_dies(served: ServedCell, arm: UR5e,
     owner = subprocess.Popen([sys.executable, "-c", OWNER, HOST], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     with owner:
         assert owner.stdout is not None
-        child = int(owner.stdout.readline())
-        took = stands_after(served, lambda: os.kill(owner.pid, number))
-        owner.kill()
+        try:
+            child = int(owner.stdout.readline())
+            took = stands_after(served, lambda: os.kill(owner.pid, number))
+        finally:
+            owner.kill()
     # One that hangs is noticed after 0.2 s without a kick.
     assert took < (STANDS_S if number is signal.SIGKILL else STANDS_S + 0.2)
     wait_until(lambda: not psutil.pid_exists(child))

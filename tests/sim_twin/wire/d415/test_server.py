@@ -13,9 +13,10 @@ from robotcell.errors import ConnectionLost
 from sim_twin.d415.renderer import MODES, Renderer
 from sim_twin.options import NoiseOptions, TwinOptions
 from sim_twin.wire.faults import Kind
+from tests.addresses import loopback
 from tests.sim_twin.wire.d415.served_camera import WITHOUT_NOISE, RawClient, ServedCamera
 
-HOST = "127.0.0.31"
+HOST = loopback(31)
 LIMIT_S = 20.0
 
 
@@ -28,7 +29,7 @@ def camera():
 @pytest.fixture(scope="module")
 def clean():
     """A camera without noise, which shows exactly what it is told."""
-    with ServedCamera("127.0.0.32", overrides=WITHOUT_NOISE) as served:
+    with ServedCamera(loopback(32), overrides=WITHOUT_NOISE) as served:
         yield served
 
 
@@ -170,17 +171,17 @@ def test_off_closes_the_port_and_it_comes_back(camera):
 
 
 def test_a_port_that_is_taken_is_named():
-    with socket.create_server(("127.0.0.33", 0)) as taken:
+    with socket.create_server((loopback(33), 0)) as taken:
         port = taken.getsockname()[1]
-        second = ServedCamera("127.0.0.33", port)
-        with pytest.raises(AssertionError, match=f"port {port} of 127.0.0.33"), second:
+        second = ServedCamera(loopback(33), port)
+        with pytest.raises(AssertionError, match=f"port {port} of {loopback(33)}"), second:
             pass
         second.end()
 
 
 @pytest.mark.parametrize("how", ["supervisor", "SIGTERM"])
 def test_it_ends_with_its_supervisor_and_on_sigterm(how):
-    with ServedCamera("127.0.0.34") as served, RawClient(served) as client:
+    with ServedCamera(loopback(34)) as served, RawClient(served) as client:
         client.frame()
         os.kill(served.process.pid, signal.SIGINT)
         client.frame()

@@ -3,10 +3,11 @@ import socket
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_twin.wire.rg2.modbus import ModbusServer, Refusal, RefusedError, answer, split_frames
+from tests.addresses import loopback
 
 PDUS = st.binary(min_size=1, max_size=253)
 # Mostly function codes that exist, with plausible numbers.
@@ -114,7 +115,7 @@ def test_an_unknown_unit_meets_silence():
 # The server
 
 
-HOST = "127.0.0.36"
+HOST = loopback(36)
 READ = frame(struct.pack(">BHH", 3, 8, 2))
 RESPONSE = frame(struct.pack(">BBHH", 3, 4, 8, 9))
 
@@ -193,6 +194,23 @@ def test_a_client_that_never_reads_is_not_listened_to_for_ever():
             await sending
 
     serve(talk, units)
+
+
+@settings(max_examples=20)
+@given(st.lists(st.one_of(st.binary(max_size=40), PDUS.map(frame)), max_size=4).map(b"".join))
+def test_after_any_noise_the_next_client_is_served(noise):
+    async def talk(server):
+        first = await asyncio.open_connection(HOST, server.port)
+        first[1].write(noise)
+        await hang_up(first)
+        while True:
+            second = await asyncio.open_connection(HOST, server.port)
+            response = await ask(second)
+            await hang_up(second)
+            if response == RESPONSE:
+                return
+
+    serve(talk)
 
 
 class Counting(Ten):

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from tests.addresses import loopback
 from tests.sim_twin.wire.ur.stub_world import START_Q, ServedController
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-HOST = "127.0.0.14"
+HOST = loopback(14)
 LIMIT_S = 60
 
 

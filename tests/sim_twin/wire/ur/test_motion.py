@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from robotcell.geometry import ur5e
 from robotcell.geometry.transforms import invert_transform, matrix_to_rotvec, rotvec_to_matrix
+from sim_twin.devices.trajectory import MAX_JOINT_JERK_RAD_S3
 from sim_twin.wire.shared_state import PERIOD_S
 from sim_twin.wire.ur.arm import Arm
 from sim_twin.wire.ur.force_mode import ForceMode
@@ -89,12 +90,15 @@ def test_joints_move_together_within_speed_and_acceleration() -> None:
     goal = START + np.array([0.5, -0.2, 0.1, 0, 0, 0.3])
     path = run(arm, follow(arm, [joints(goal)]))
     np.testing.assert_array_equal(path[-1], goal)
-    assert speeds(path).max() <= 1.0 + 1e-9
-    assert np.abs(np.diff(path, n=2, axis=0)).max() / PERIOD_S**2 <= 2.0 + 1e-6
+    assert speeds(path).max() <= 1.0 + 1e-6
+    acceleration = np.diff(path, n=2, axis=0) / PERIOD_S**2
+    assert np.abs(acceleration).max() <= 2.0 + 1e-4
+    assert np.abs(np.diff(acceleration, axis=0)).max() / PERIOD_S <= MAX_JOINT_JERK_RAD_S3
     share = (path - START) / (goal - START + (goal == START))
     np.testing.assert_allclose(share[:, 0], share[:, 5], atol=1e-9)
-    # A trapezoid: the time of the ramps and of the rest.
-    assert (len(path) - 1) * PERIOD_S == pytest.approx(0.5 / 1.0 + 1.0 / 2.0, abs=2 * PERIOD_S)
+    # The time of the ramps and of the rest, of the smoothing and of the planning.
+    smoothing = 2 * 2.0 / MAX_JOINT_JERK_RAD_S3
+    assert (len(path) - 1) * PERIOD_S == pytest.approx(0.5 / 1.0 + 1.0 / 2.0 + smoothing, abs=0.01)
     assert stands(arm)
 
 
@@ -110,32 +114,32 @@ def test_a_straight_move_stays_on_its_line() -> None:
     poses = np.array([arm.forward(q) for q in path])
     way = poses[:, :3, 3] - T[:3, 3]
     direction = (goal - T)[:3, 3] / np.linalg.norm((goal - T)[:3, 3])
-    assert np.abs(way - np.outer(way @ direction, direction)).max() < 1e-9
-    assert np.abs(np.diff(way @ direction)).max() / PERIOD_S <= 0.25 + 1e-6
+    assert np.abs(way - np.outer(way @ direction, direction)).max() < 2e-5
+    assert np.abs(np.diff(way @ direction)).max() / PERIOD_S <= 0.25 + 1e-4
     turns = [matrix_to_rotvec(pose[:3, :3] @ T[:3, :3].T)[2] for pose in poses]
-    np.testing.assert_allclose(np.array(turns) / 0.4, way @ direction / 0.15, atol=1e-6)
+    np.testing.assert_allclose(np.array(turns) / 0.4, way @ direction / 0.15, atol=1e-4)
 
 
-@pytest.mark.parametrize("straight", [False, True])
-def test_a_blend_cuts_the_corner_within_its_radius(straight: bool) -> None:
+@pytest.mark.parametrize("kinds", [(False, False), (True, True), (False, True), (True, False)])
+def test_a_blend_cuts_the_corner_within_its_radius(kinds: tuple[bool, bool]) -> None:
     arm = Arm(START)
     T = arm.forward(START)
     corner, goal = T.copy(), T.copy()
     corner[:3, 3] += [0, 0, -0.15]
     goal[:3, 3] += [0, 0.15, -0.15]
-    if straight:
-        moves = [line(corner, blend=0.03), line(goal)]
-    else:
-        moves = [joints(arm.inverse(corner, START), blend=0.03), joints(arm.inverse(goal, START))]
+    moves = [
+        line(T, blend=blend) if straight else joints(arm.inverse(T, START), blend=blend)
+        for T, straight, blend in zip((corner, goal), kinds, (0.03, 0.0), strict=True)
+    ]
     places = np.array([arm.forward(q)[:3, 3] for q in run(arm, follow(arm, moves))])
-    np.testing.assert_allclose(places[-1], goal[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(places[-1], goal[:3, 3], atol=1e-6)
     nearest = np.linalg.norm(places - corner[:3, 3], axis=1).min()
     assert 0.001 < nearest < 0.03
     # Without a blend the arm comes to a standstill in the corner itself.
     other = Arm(START)
     exact = [Move(m.target, m.is_pose, m.straight, m.speed, m.acceleration) for m in moves]
     unblended = np.array([other.forward(q)[:3, 3] for q in run(other, follow(other, exact))])
-    assert np.linalg.norm(unblended - corner[:3, 3], axis=1).min() < 1e-9
+    assert np.linalg.norm(unblended - corner[:3, 3], axis=1).min() < 1e-6
     assert len(places) < len(unblended)
 
 
@@ -251,7 +255,7 @@ def test_two_motions_at_a_time_are_refused() -> None:
     other = follow(arm, [joints(START + 0.1)])
     next(one)
     with pytest.raises(ScriptError, match="another thread"):
-        next(other)
+        list(other)
 
 
 def test_a_motion_cannot_go_on_where_the_arm_no_longer_is() -> None:

@@ -216,8 +216,9 @@ def test_the_control_script_tells_its_offset_and_its_path() -> None:
     )
     assert received(control_script(path, offset=24)) == [ControlScript(24, moves)]
     assert received(control_script()) == [ControlScript(0, ())]
-    [refused] = received(control_script("\tmovej([1])\n"))
-    assert isinstance(refused, Refused)
+    for wrong in (control_script("\tmovej([1])\n"), control_script(offset=999)):
+        [refused] = received(wrong)
+        assert isinstance(refused, Refused)
 
 
 @pytest.mark.parametrize("version", [(3, 15), (5, 12), (5, 25)])

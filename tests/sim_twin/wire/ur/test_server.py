@@ -17,6 +17,7 @@ from robotcell.geometry import ur5e
 from sim_twin.wire.faults import Fault, Kind
 from sim_twin.wire.ur.pose import matrix_to_pose
 from sim_twin.wire.ur.variables import OUTPUTS
+from tests.addresses import loopback
 from tests.sim_twin.wire.ur.control_script import CONTROL_SCRIPT
 from tests.sim_twin.wire.ur.rtde_client import RtdeClient, reading
 from tests.sim_twin.wire.ur.stub_world import START_Q, ServedController
@@ -24,7 +25,7 @@ from tests.sim_twin.wire.ur.stub_world import START_Q, ServedController
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-HOST, OTHER = "127.0.0.11", "127.0.0.12"
+HOST, OTHER = loopback(11), loopback(12)
 DASHBOARD, PRIMARY, SECONDARY, SCRIPT, RTDE = 29999, 30001, 30002, 30003, 30004
 START = np.array(START_Q)
 
@@ -539,14 +540,14 @@ def _read_on(client: RtdeClient) -> None:
 def test_a_port_that_is_taken_is_named() -> None:
     with contextlib.closing(socket.socket()) as taken:
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        taken.bind(("127.0.0.13", 30003))
+        taken.bind((loopback(13), 30003))
         taken.listen()
-        with ServedController("127.0.0.13") as served:
-            assert "port 30003 of 127.0.0.13 (script of the arm) cannot be opened" in served.endpoints["error"]
+        with ServedController(loopback(13)) as served:
+            assert f"port 30003 of {loopback(13)} (script of the arm) cannot be opened" in served.endpoints["error"]
 
 
 def test_sigterm_ends_it_with_clients_connected() -> None:
-    with ServedController("127.0.0.13") as served, reading("127.0.0.13", "timestamp") as client:
+    with ServedController(loopback(13)) as served, reading(loopback(13), "timestamp") as client:
         client.package()
         os.kill(served.process.pid or 0, signal.SIGINT)
         time.sleep(0.1)
