@@ -99,6 +99,9 @@ class Follower:
     def started(self, _job_id: int, _run_dir: Path) -> None:
         """As the job's observer."""
 
+    def checked(self, _findings: object) -> None:
+        """As the job's observer."""
+
     def looked(self, view: View) -> None:
         """As the job's observer."""
 
