@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from robotcell.findings import Finding
     from robotcell.interfaces import Camera, Gripper, GripperState, RgbdFrame
     from robotcell.jobs.decision import Decision
-    from robotcell.motion.plan import MotionPlan
     from robotcell.perception.view import View
 
 SCENE = """
@@ -207,11 +206,11 @@ def test_an_unsafe_action_is_refused_and_nothing_moves(config: CellConfig) -> No
 def test_an_action_that_somebody_declines_is_barred_and_another_one_decided(config: CellConfig) -> None:
     # More than the failures that end a job: a no is none.
     policy = Scripted([grasp_at(-0.4, 0.01 * i) for i in range(12)] + [grasp_at(*RED)])
-    asked: list[tuple[Decision, MotionPlan]] = []
+    asked: list[tuple[Decision, CheckedPlan]] = []
     with Journal(config.journal.database_url()) as journal, open_cell(config) as cell:
         q = cell.arm.state().q
 
-        def confirm(decision: Decision, plan: MotionPlan) -> bool:
+        def confirm(decision: Decision, plan: CheckedPlan) -> bool:
             np.testing.assert_allclose(cell.arm.state().q, q, atol=1e-3)
             asked.append((decision, plan))
             return len(asked) > 12
@@ -222,7 +221,7 @@ def test_an_action_that_somebody_declines_is_barred_and_another_one_decided(conf
     assert [row.outcome.result for row in rows if row.outcome] == ["declined"] * 12 + ["picked"]
     assert [len(observation.barred) for observation in policy.seen] == list(range(13))
     assert report.metrics.actions == 1
-    assert asked[-1][1].steps[0].label == "pre-shape"
+    assert asked[-1][1].plan.steps[0].label == "pre-shape"
 
 
 def test_ten_failures_in_a_row_end_the_run(config: CellConfig) -> None:
