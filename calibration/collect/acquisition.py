@@ -20,6 +20,7 @@ from calibration.solve.se3 import difference
 from calibration.target.detection import Detector
 from calibration.target.held_board import HeldBoard
 from robotcell.errors import CalibrationError, UnsafeMotion
+from robotcell.geometry.bodies import blocks_view
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -73,7 +74,7 @@ def collect(cell: Cell, folder: Path, held: HeldBoard, count: int, seed: int, pr
     q_first = cell.arm.state().q
     T_base_camera = cell.config.camera.pose()
     # What stands there stays there: the arm comes back to where it stood for this frame.
-    frame = cell.camera.read()
+    frame, area = cell.camera.read(), cell.config.workspace
     for _ in range(_ROUNDS):
         views = read_session(folder)
         taken = len(views)
@@ -83,7 +84,9 @@ def collect(cell: Cell, folder: Path, held: HeldBoard, count: int, seed: int, pr
         if estimate is not None and taken >= _PLAN_AGAIN_VIEWS:
             T_base_camera, held = estimate.T_base_camera, HeldBoard(held.board, estimate.T_flange_board)
         seen = list(np.linalg.inv(T_base_camera) @ views.T_base_flange @ held.T_flange_board)
-        standing = what_stands(frame, q_first, held, T_base_camera, cell.config)
+        standing = None
+        if not blocks_view(q_first, T_base_camera[:3, 3], area.x, area.y, cell.config.table.height_m):
+            standing = what_stands(frame, q_first, held, T_base_camera, cell.config)
         plan = plan_views(
             cell.config,
             held,
@@ -145,7 +148,12 @@ def _is_elsewhere(estimate: RunningEstimate, T_base_camera: Array) -> bool:
 
 
 def _go_back(
-    cell: Cell, q_first: Array, q_via: Array, held: HeldBoard, standing: ClearanceMap, progress: CollectionProgress
+    cell: Cell,
+    q_first: Array,
+    q_via: Array,
+    held: HeldBoard,
+    standing: ClearanceMap | None,
+    progress: CollectionProgress,
 ) -> None:
     try:
         motions = plan_motions("go back", cell.arm.state().q, q_first, q_via, held, cell.config, standing)

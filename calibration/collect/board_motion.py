@@ -30,6 +30,7 @@ _CLEARANCE_M = 0.015
 _ABOVE_TABLE_M = TALLEST_OBJECT_M + _CLEARANCE_M
 # A plate that sways: slower than a job.
 _JOINT_SPEED_RAD_S = 0.6
+_ROUNDING_M = 0.002
 # Indices of the first wrist and of the flange among the links of `bodies.Spheres`.
 _WRISTS, FLANGE = 4, 6
 
@@ -75,11 +76,13 @@ def plan_motion(
     move = JointMove(label, q, speed, config.motion.joint_acceleration_rad_s2)
     checked = check_path(MotionPlan(label, q_start, (move,)), config, seen)
     # Where the arm stands now is a fact: only where it goes is checked.
-    _check_board(checked.joint_paths[0][1:], held, config, label, seen)
+    _check_board(checked.joint_paths[0][1:], held, config, label)
+    if seen is not None:
+        _check_clear(checked.joint_paths[0], held, seen, label)
     return checked
 
 
-def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str, seen: ClearanceMap | None) -> None:
+def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str) -> None:
     """Keep the plate clear of table, obstacles and arm along joint angles (N, 6)."""
     T_base_flange = ur5e.forward(path)
     points = np.einsum("nij,kj->nki", T_base_flange[:, :3, :3], held.points) + T_base_flange[:, None, :3, 3]
@@ -88,10 +91,6 @@ def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str, s
     lowest = min(points[..., 2].min(), (centers[:, wrists, 2] - bodies.SPHERES.radius[wrists]).min())
     if lowest < config.table.height_m + _ABOVE_TABLE_M:
         raise UnsafeMotion(f"{label}: the board or the wrist would touch what may stand on the table")
-    if seen is not None:
-        corners = points.reshape(-1, 3)
-        if seen.gaps(corners, np.zeros(len(corners)), 0.0, _CLEARANCE_M).min() < _CLEARANCE_M:
-            raise UnsafeMotion(f"{label}: the board would touch what the camera saw on the table")
     for box in obstacles(config):
         if bodies.box_distance(*box.corners(), points).min() < _CLEARANCE_M:
             raise UnsafeMotion(f"{label}: the board would enter the keep-out {box.name!r}")
@@ -101,3 +100,16 @@ def _check_board(path: Array, held: HeldBoard, config: CellConfig, label: str, s
     )
     if gaps.min() < _CLEARANCE_M:
         raise UnsafeMotion(f"{label}: the board would touch the arm")
+
+
+def _check_clear(path: Array, held: HeldBoard, seen: ClearanceMap, label: str) -> None:
+    """Keep the plate clear of what stands higher than it may go, along joint angles (N, 6) from where it starts.
+
+    A point of the plate that is too near to something at the start must not come nearer.
+    """
+    T_base_flange = ur5e.forward(path)
+    points = np.einsum("nij,kj->nki", T_base_flange[:, :3, :3], held.points) + T_base_flange[:, None, :3, 3]
+    flat = points.reshape(-1, 3)
+    gaps = seen.gaps(flat, np.zeros(len(flat)), _ABOVE_TABLE_M, _CLEARANCE_M).reshape(points.shape[:2])
+    if (gaps < np.minimum(_CLEARANCE_M, gaps[0]) - _ROUNDING_M).any():
+        raise UnsafeMotion(f"{label}: the board would touch what the camera saw on the table")

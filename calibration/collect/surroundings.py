@@ -6,6 +6,7 @@ larger than it looks. What arm and board hide counts as what the camera does not
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
@@ -16,7 +17,7 @@ from robotcell.config.surroundings import bin_box
 from robotcell.geometry import bodies, ur5e
 from robotcell.geometry.transforms import make_transform, transform_points
 from robotcell.perception.calibrated_camera import CalibratedCamera
-from robotcell.perception.clearance_map import build_clearance_map
+from robotcell.perception.clearance_map import RESOLUTION_M, build_clearance_map
 
 if TYPE_CHECKING:
     from calibration.target.held_board import HeldBoard
@@ -48,7 +49,20 @@ def what_stands(frame: RgbdFrame, q: Array, held: HeldBoard, T_base_camera: Arra
     camera = CalibratedCamera(_levelled(frame, T_base_camera, config.table.height_m))
     own = _own_pixels(frame, q, held, camera)
     seen = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),), own)
-    return seen.widened(_GUESS_M)
+    return _without_own(seen.widened(_GUESS_M), np.asarray(transform_points(ur5e.forward(q), held.points), np.float64))
+
+
+def _without_own(seen: ClearanceMap, board: Array) -> ClearanceMap:
+    """The map with nothing where the board (N, 3) [m] itself stood, as far around as the map was widened."""
+    lowest = np.full(seen.ceiling_m.shape, np.inf, np.float32)
+    rows, cols = seen.ceiling_m.shape
+    cells = np.floor((board[:, :2] - seen.origin) / RESOLUTION_M).astype(np.intp)
+    inside = ((cells >= 0) & (cells < (cols, rows))).all(axis=1)
+    col, row = cells[inside, 0], cells[inside, 1]
+    np.minimum.at(lowest, (row, col), (board[inside, 2] - seen.table_height_m - _GUESS_M).astype(np.float32))
+    size = 2 * int(np.ceil(_GUESS_M / RESOLUTION_M)) + 1
+    around = cv2.erode(lowest, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+    return replace(seen, ceiling_m=np.asarray(np.minimum(seen.ceiling_m, np.maximum(around, 0.0)), np.float32))
 
 
 def _levelled(frame: RgbdFrame, T_base_camera: Array, table_height_m: float) -> Array:

@@ -383,5 +383,6 @@ def _violations(
         words = f"the arm, the gripper or its load would enter the keep-out {box.name!r}"
         yield body.any(axis=1) | fingers.any(axis=1), lambda _, words=words: words  # type: ignore[misc]
     touching = bodies.self_distance(centers) < limits.clearance_m
-    touching |= bodies.hand_distance(centers, T_tcp, load_m) < limits.clearance_m
+    if load_m > 0:
+        touching |= bodies.hand_distance(centers, T_tcp, load_m) < limits.clearance_m
     yield touching, lambda _: "the arm, the gripper or its load would touch the arm itself"

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # What the camera did not see may be as tall as the tallest block.
 TALLEST_OBJECT_M = TALLEST_BLOCK_M
-# Where contact is meant, fingers may touch what is up to so much higher than the tallest block, or than what is
-# grasped: the map of clearance rounds up.
-_TOUCH_MARGIN_M = 0.020
+# Where contact is meant, fingers may touch what lies in a heap of blocks, or is not much taller than what is grasped:
+# the map of clearance rounds up.
+_HEAP_M, _TOUCH_MARGIN_M = 0.180, 0.020
 # The gripper is taken to be this much larger all round, for what it comes down beside.
 _AROUND_M = 0.004
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
@@ -76,7 +76,7 @@ def tool_down_solutions(T_base_tcp: Array, config: CellConfig) -> list[Array]:
 
 def touch_height(top_m: float) -> float:
     """Height above the table [m] up to which things may be touched where something with that top is meant."""
-    return max(TALLEST_OBJECT_M, top_m) + _TOUCH_MARGIN_M
+    return max(_HEAP_M, top_m + _TOUCH_MARGIN_M)
 
 
 def near_height(

@@ -19,7 +19,7 @@ import numpy as np
 
 from robotcell.config.surroundings import obstacles
 from robotcell.errors import UnsafeMotion
-from robotcell.geometry import rg2, ur5e
+from robotcell.geometry import bodies, rg2, ur5e
 from robotcell.geometry.transforms import make_transform, rotation_z
 from robotcell.motion.actions import above, plan_action
 from robotcell.motion.clearance import Obstructed, standing_clear
@@ -43,12 +43,14 @@ _AZIMUTH_RAD = np.radians(15.0)
 _RADII_M = (0.25, 0.35, 0.45, 0.55, 0.65, 0.75)
 _HEIGHTS_M = (0.20, 0.32, 0.44, 0.56, 0.68)
 # Poses straight above the ends of a way.
-_RISES_M = (0.08, 0.16, 0.24, 0.34, 0.44, 0.54)
+_RISES_M = (0.06, 0.12, 0.18, 0.24, 0.32, 0.40, 0.48)
 _NEIGHBOURS = 10
 # Ends of a way are connected with so many of the nearest poses.
 _NEAREST_TO_END = 24
 # Where a motion is looked at before all of it is checked.
 _GLANCES = np.array([[0.5], [0.25], [0.75]])
+# Fingers in the poses of the roadmap keep this distance from the arm.
+_FROM_ARM_M = 0.02
 # Edges that are checked before a search is given up.
 _MOST_CHECKS = 60
 # Plans that are led around what is in the way before an action is given up.
@@ -302,5 +304,8 @@ def _roadmap(home_q: tuple[float, ...], table_height_m: float) -> Array:
                 if q is not None and np.abs(q - start).max() < np.pi / 2:
                     poses.append(q)
     result = np.array(poses).reshape(-1, 6)
+    # The fingers, which the path check holds against the arm only where they carry something, keep clear of it too.
+    T_tcp = ur5e.forward(result) @ rg2.T_FLANGE_TCP
+    result = result[bodies.hand_distance(bodies.sphere_centers(result), T_tcp, 0.0) > _FROM_ARM_M]
     result.flags.writeable = False
     return result

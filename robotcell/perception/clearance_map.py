@@ -109,11 +109,12 @@ class ClearanceMap:
         return gaps
 
     def widened(self, by_m: float) -> ClearanceMap:
-        """The map with all that may stand there so much wider to all sides and higher [m]."""
+        """The map with all that the camera saw so much wider to all sides and higher [m]."""
         size = 2 * int(np.ceil(by_m / RESOLUTION_M)) + 1
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        ceiling = np.asarray(cv2.dilate(self.ceiling_m, disc), np.float32)
+        ceiling = np.asarray(cv2.dilate(np.where(self.looked_at, self.ceiling_m, np.float32(0)), disc), np.float32)
         ceiling[ceiling > 0] += np.float32(by_m)
+        ceiling = np.maximum(ceiling, self.ceiling_m)
         open_top = cv2.dilate(self.open_top.astype(np.uint8), disc) > 0
         return replace(self, ceiling_m=ceiling, open_top=open_top)
 

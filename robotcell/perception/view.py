@@ -64,13 +64,24 @@ def look(devices: Devices, config: CellConfig, workspace: Workspace | None = Non
 
 
 def view_blocked(devices: Devices, config: CellConfig, workspace: Workspace | None = None, load_m: float = 0.0) -> bool:
-    """Whether the arm, or a load that reaches so far [m] from the tcp, stands between the camera and the workspace.
+    """Whether the arm, or a load, stands between the camera and the workspace, or the load above it.
+
+    Args:
+        devices: connected.
+        config: of the cell.
+        workspace: rectangle of the table; that of the cell unless given.
+        load_m: how far a load reaches from the tcp to any side; 0 without one.
 
     Raises:
         ConnectionLost: the arm cannot be asked.
     """
     workspace, eye = workspace or config.workspace, CalibratedCamera.of(config.camera).position
-    q, table = devices.arm.state().q, config.table.height_m
+    state, table = devices.arm.state(), config.table.height_m
+    q, (x, y, _) = state.q, state.T_base_tcp[:3, 3]
+    inside = all(low - load_m < v < high + load_m for v, (low, high) in ((x, workspace.x), (y, workspace.y)))
+    if load_m > 0 and inside:
+        # It hides where it was taken from less than it is seen there itself.
+        return True
     return blocks_view(q, eye, workspace.x, workspace.y, table, load_m)
 
 

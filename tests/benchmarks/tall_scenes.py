@@ -32,7 +32,7 @@ from robotcell.config import load_config
 from robotcell.errors import CellError, UnsafeMotion
 from robotcell.geometry import bodies
 from robotcell.geometry.transforms import make_transform, rotation_z, transform_points
-from robotcell.interfaces import Devices
+from robotcell.interfaces import Devices, JointWaypoint
 from robotcell.jobs.job import run_job
 from robotcell.jobs.journal import Journal
 from robotcell.motion.grasp import Grasp, grasp_height
@@ -48,9 +48,11 @@ from sim_twin.world import robot_model
 from tests.robotcell.maps import heightmap
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
-    from robotcell.interfaces import ArmState
+    from robotcell.interfaces import ArmState, Waypoint
     from sim_twin.scenes.shapes import Shape
     from sim_twin.world.world import World
 
@@ -128,18 +130,19 @@ class WatchedArm:
     def state(self) -> ArmState:
         return self._arm.state()  # type: ignore[no-any-return]
 
-    def start_joints(self, q: Array, speed: float, acceleration: float) -> None:
-        self.contact_is_meant, self.leaves, self.label = False, False, "joint motion"
-        self._arm.start_joints(q, speed, acceleration)
-
-    def start_linear(self, T_base_tcp: Array, speed: float, acceleration: float) -> None:
-        guarded = speed == self._guarded_m_s
-        up = T_base_tcp[:3, 3] - self._arm.state().T_base_tcp[:3, 3]
-        straight_up = up[2] > 0 and float(np.hypot(*up[:2])) < 0.005
-        self.leaves = not guarded and straight_up and self.contact_is_meant
-        self.contact_is_meant = guarded or self.leaves
-        self.label = "guarded motion" if guarded else "lift" if self.leaves else "straight motion"
-        self._arm.start_linear(T_base_tcp, speed, acceleration)
+    def start_path(self, waypoints: Sequence[Waypoint]) -> None:
+        """A blended motion is known by its first leg: a lift that goes over into the way to the bin is a lift."""
+        first = waypoints[0]
+        if isinstance(first, JointWaypoint):
+            self.contact_is_meant, self.leaves, self.label = False, False, "joint motion"
+        else:
+            guarded = first.speed_m_s == self._guarded_m_s
+            up = first.T_base_tcp[:3, 3] - self._arm.state().T_base_tcp[:3, 3]
+            straight_up = up[2] > 0 and float(np.hypot(*up[:2])) < 0.005
+            self.leaves = not guarded and straight_up and self.contact_is_meant
+            self.contact_is_meant = guarded or self.leaves
+            self.label = "guarded motion" if guarded else "lift" if self.leaves else "straight motion"
+        self._arm.start_path(waypoints)
 
 
 class Watcher:

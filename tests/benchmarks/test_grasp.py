@@ -5,22 +5,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from policy import make_policy
 from robotcell.cell import Cell, open_cell
 from robotcell.config import load_config
+from robotcell.config.surroundings import bin_box
+from robotcell.geometry.transforms import make_transform
 from robotcell.jobs.policy_api import Observation, PickAny
-from robotcell.motion.actions import Action, plan_action
 from robotcell.motion.grasp import Grasp
-from robotcell.motion.path_check import CheckedPlan, check_path
+from robotcell.motion.way import plan_way
+from robotcell.perception.clearance_map import build_clearance_map
+from sim_twin.devices.backend import open_twin
+from sim_twin.scenes.meshes import hull
+from sim_twin.scenes.scene import Scene, SceneObject
+from sim_twin.scenes.shapes import block, shape_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from pytest_benchmark.fixture import BenchmarkFixture
 
+    from robotcell.geometry.transforms import Array
     from robotcell.jobs.policy_api import Policy
+    from robotcell.motion.actions import Action
+    from robotcell.motion.path_check import CheckedPlan
     from robotcell.perception.view import View
 
 ROUNDS = 7
@@ -43,8 +53,7 @@ class Bench:
         return action
 
     def plan(self, view: View, action: Action) -> CheckedPlan:
-        plan = plan_action(action, view.heightmap, self.cell.arm.state().q, self.cell.config)
-        return check_path(plan, self.cell.config)
+        return plan_way(action, view.heightmap, view.clearance, self.cell.arm.state().q, self.cell.config)
 
     def run(self, checked: CheckedPlan) -> None:
         self.cell.executor.run(checked)
@@ -88,3 +97,30 @@ def test_run(benchmark: BenchmarkFixture, bench: Bench) -> None:
         return (bench.plan(view, bench.decide(view)),), {}
 
     benchmark.pedantic(bench.run, setup=setup, rounds=ROUNDS)
+
+
+def test_map_of_clearance(benchmark: BenchmarkFixture, bench: Bench) -> None:
+    """What the path check asks, once per frame: part of the look, and of the first plan by it."""
+    view, config = bench.look(), bench.cell.config
+
+    def build() -> float:
+        seen = build_clearance_map(view.frame, view.camera, config.table.height_m, (bin_box(config),))
+        return float(seen.gaps(np.array([[-0.5, 0.0, 0.05]]), np.array([0.05]), 0.0, 0.1)[0])
+
+    benchmark.pedantic(build, rounds=ROUNDS)
+
+
+def test_plan_among_posts(benchmark: BenchmarkFixture) -> None:
+    """A way over a post of 0.25 m beside the goal: what a detour costs."""
+    config = load_config(None, {"backend.options.objects": 1})
+    corners = np.array([(a, b, c) for a in (-0.03, 0.03) for b in (-0.03, 0.03) for c in (-0.125, 0.125)])
+    post = SceneObject("post", shape_of("post", (hull(corners),)), (78, 121, 167), _at(-0.5, 0.10, 0.125))
+    cube = SceneObject("cube", block("cube"), (255, 60, 60), _at(-0.5, 0.0, 0.025))
+    with open_twin(config, Scene("post", (cube, post), drop=False))[0] as cell:
+        view, q = cell.look(), cell.arm.state().q
+        grasp = Grasp(-0.5, 0.0, 0.05, 5, 1.0)
+        benchmark.pedantic(plan_way, args=(grasp, view.heightmap, view.clearance, q, config), rounds=ROUNDS)
+
+
+def _at(x: float, y: float, z: float) -> Array:
+    return make_transform(np.eye(3), (x, y, z))

@@ -174,7 +174,7 @@ class UR5e(Arm):
         """Start a motion along several legs; see `Arm`. A path of one leg is the motion of that leg.
 
         The controller rounds the corners by its own rule, within the radii. ur_rtde has no command for a path: it ends
-        our program and sends it anew with the path in it, which takes a tenth of a second and leaves the arm standing.
+        our program and sends it anew with the path in it. Meanwhile the arm stands.
 
         Raises:
             UnsafeMotion: a leg is outside the ranges, a blend radius too, or the arm is moving.

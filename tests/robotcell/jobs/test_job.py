@@ -257,7 +257,13 @@ class BlueForRed:
         self._camera.close()
 
     def read(self) -> RgbdFrame:
-        frame = self._camera.read()
+        return self._painted(self._camera.read())
+
+    def poll(self, since: float) -> Callable[[], RgbdFrame] | None:
+        develop = self._camera.poll(since)
+        return None if develop is None else lambda: self._painted(develop())
+
+    def _painted(self, frame: RgbdFrame) -> RgbdFrame:
         self._count += 1
         if self._count - 1 not in self._looks:
             return frame
@@ -439,7 +445,7 @@ def test_an_interrupt_while_the_fingers_close_stops_them(config: CellConfig, mon
         cell.gripper.start_width(0.11, 40.0)
         cell.clock.sleep(1.5)
         checked = grasp_plan(cell)
-        interrupt(monkeypatch, cell.gripper, "state", call=8)
+        interrupt(monkeypatch, cell.gripper, "state", call=5)
         with pytest.raises(KeyboardInterrupt):
             cell.executor.run(checked)
         width = cell.gripper.state().width_m
