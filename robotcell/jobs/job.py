@@ -372,7 +372,8 @@ class _Job:
         outcome = judge(decision.action, decision.goal, decision.view, view, as_planned)
         workspace = view.heightmap.workspace
         progress = self.progress.after(decision.goal, decision.task, decision.action, outcome, workspace)
-        return _Ahead(outcome.result, self._choose(view, progress))
+        given_up = progress.failures >= MAX_FAILURES_IN_A_ROW
+        return _Ahead(outcome.result, None if given_up else self._choose(view, progress))
 
 
 def _describe(error: BaseException) -> str:
