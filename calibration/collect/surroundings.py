@@ -49,7 +49,7 @@ def what_stands(frame: RgbdFrame, q: Array, held: HeldBoard, T_base_camera: Arra
     camera = CalibratedCamera(_levelled(frame, T_base_camera, config.table.height_m))
     own = _own_pixels(frame, q, held, camera)
     seen = build_clearance_map(frame, camera, config.table.height_m, (bin_box(config),), own)
-    return _without_own(seen.widened(_GUESS_M), transform_points(ur5e.forward(q), held.points))
+    return _without_own(seen.widened(_GUESS_M), np.asarray(transform_points(ur5e.forward(q), held.points), np.float64))
 
 
 def _without_own(seen: ClearanceMap, board: Array) -> ClearanceMap:
@@ -58,7 +58,7 @@ def _without_own(seen: ClearanceMap, board: Array) -> ClearanceMap:
     rows, cols = lowest.shape
     cells = np.floor((board[:, :2] - seen.origin) / RESOLUTION_M).astype(np.intp)
     inside = ((cells >= 0) & (cells < (cols, rows))).all(axis=1)
-    col, row = cells[inside].T
+    col, row = cells[inside, 0], cells[inside, 1]
     np.minimum.at(lowest, (row, col), (board[inside, 2] - seen.table_height_m - _GUESS_M).astype(np.float32))
     size = 2 * int(np.ceil(_GUESS_M / RESOLUTION_M)) + 1
     around = cv2.erode(lowest, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
