@@ -54,8 +54,8 @@ def what_stands(frame: RgbdFrame, q: Array, held: HeldBoard, T_base_camera: Arra
 
 def _without_own(seen: ClearanceMap, board: Array) -> ClearanceMap:
     """The map with nothing where the board (N, 3) [m] itself stood, as far around as the map was widened."""
-    lowest = np.full(seen.ceiling_m.shape, np.inf, np.float32)
-    rows, cols = lowest.shape
+    lowest = np.full_like(seen.ceiling_m, np.inf)
+    rows, cols = seen.ceiling_m.shape[0], seen.ceiling_m.shape[1]
     cells = np.floor((board[:, :2] - seen.origin) / RESOLUTION_M).astype(np.intp)
     inside = ((cells >= 0) & (cells < (cols, rows))).all(axis=1)
     col, row = cells[inside, 0], cells[inside, 1]
