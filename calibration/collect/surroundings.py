@@ -54,7 +54,7 @@ def what_stands(frame: RgbdFrame, q: Array, held: HeldBoard, T_base_camera: Arra
 
 def _without_own(seen: ClearanceMap, board: Array) -> ClearanceMap:
     """The map with nothing where the board (N, 3) [m] itself stood, as far around as the map was widened."""
-    lowest = np.full(seen.ceiling_m.shape, np.inf, np.float32)
+    lowest = np.full_like(seen.ceiling_m, np.inf)
     rows, cols = seen.ceiling_m.shape
     cells = np.floor((board[:, :2] - seen.origin) / RESOLUTION_M).astype(np.intp)
     inside = ((cells >= 0) & (cells < (cols, rows))).all(axis=1)

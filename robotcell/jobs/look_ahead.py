@@ -9,7 +9,7 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from robotcell.errors import CellError, ConnectionLost, DeviceFault
+from robotcell.errors import CalibrationError, CellError, ConnectionLost, DeviceFault
 from robotcell.motion.grasp import LOAD_REACH_M
 from robotcell.perception.view import View, see, view_blocked
 
@@ -38,7 +38,7 @@ class LookAhead(Generic[T]):
         self._since: float | None = None
         # Since then: times on the cell's clock [s] and joint angles (6,) [rad].
         self._course: list[tuple[float, Array]] = []
-        self._thoughts: Future[tuple[View, T]] | None = None
+        self._thoughts: Future[tuple[View, T] | None] | None = None
         self._lost: CellError | None = None
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="look-ahead")
 
@@ -71,18 +71,22 @@ class LookAhead(Generic[T]):
             self._thoughts = self._thread.submit(self._see, develop)
 
     def result(self) -> tuple[View, T] | None:
-        """The view, and what came of it; None where no frame was taken. Waits for the thread.
+        """The view, and what came of it; None where no frame of use was taken. Waits for the thread.
+
+        An arm that still moves may hide what it would not hide at home: a frame of no use says nothing of the cell.
 
         Raises:
             ConnectionLost, DeviceFault: the camera delivers nothing, or stale frames.
-            DeviceFault, CalibrationError: the frame is of no use, see `robotcell.perception.view.see`.
         """
         if self._lost is not None:
             raise self._lost
         return None if self._thoughts is None else self._thoughts.result()
 
-    def _see(self, develop: Callable[[], RgbdFrame]) -> tuple[View, T]:
+    def _see(self, develop: Callable[[], RgbdFrame]) -> tuple[View, T] | None:
         frame = develop()
         q = min(self._course, key=lambda entry: abs(entry[0] - frame.t))[1]
-        view = see(frame, self._cell.config, q, self._workspace)
+        try:
+            view = see(frame, self._cell.config, q, self._workspace)
+        except (CalibrationError, DeviceFault):
+            return None
         return view, self._think(view)

@@ -32,7 +32,7 @@ from robotcell.config import load_config
 from robotcell.errors import CellError, UnsafeMotion
 from robotcell.geometry import bodies
 from robotcell.geometry.transforms import make_transform, rotation_z, transform_points
-from robotcell.interfaces import Devices, JointWaypoint
+from robotcell.interfaces import Devices
 from robotcell.jobs.job import run_job
 from robotcell.jobs.journal import Journal
 from robotcell.motion.grasp import Grasp, grasp_height
@@ -48,11 +48,9 @@ from sim_twin.world import robot_model
 from tests.robotcell.maps import heightmap
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from robotcell.config import CellConfig
     from robotcell.geometry.transforms import Array
-    from robotcell.interfaces import ArmState, Waypoint
+    from robotcell.interfaces import ArmState
     from sim_twin.scenes.shapes import Shape
     from sim_twin.world.world import World
 
@@ -60,6 +58,8 @@ COLORS = {"red": (255, 60, 60), "green": (60, 170, 70), "yellow": (235, 200, 40)
 TALL_COLOR = (78, 121, 167)
 # Contacts that press with less are rounding of the engine [N].
 TOUCH_N = 0.2
+# A tcp this far to the side has left the line straight up [m].
+LINE_M = 0.010
 GOAL_SHAPES = ("cube", "cylinder", "hexagonal_slab", "tall_block")
 
 
@@ -123,6 +123,7 @@ class WatchedArm:
         self.contact_is_meant = False
         self.leaves = False
         self.label = "stands"
+        self._from, self._guarded_below_m = np.zeros(2), -1.0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._arm, name)
@@ -130,19 +131,25 @@ class WatchedArm:
     def state(self) -> ArmState:
         return self._arm.state()  # type: ignore[no-any-return]
 
-    def start_path(self, waypoints: Sequence[Waypoint]) -> None:
-        """A blended motion is known by its first leg: a lift that goes over into the way to the bin is a lift."""
-        first = waypoints[0]
-        if isinstance(first, JointWaypoint):
-            self.contact_is_meant, self.leaves, self.label = False, False, "joint motion"
-        else:
-            guarded = first.speed_m_s == self._guarded_m_s
-            up = first.T_base_tcp[:3, 3] - self._arm.state().T_base_tcp[:3, 3]
-            straight_up = up[2] > 0 and float(np.hypot(*up[:2])) < 0.005
-            self.leaves = not guarded and straight_up and self.contact_is_meant
-            self.contact_is_meant = guarded or self.leaves
-            self.label = "guarded motion" if guarded else "lift" if self.leaves else "straight motion"
+    def start_path(self, waypoints: Any) -> None:
+        """A motion of several legs: from contact straight up, or down into a guarded leg after the leg before it."""
+        self._from = self._arm.state().T_base_tcp[:2, 3]
+        guarded = getattr(waypoints[-1], "speed_m_s", None) == self._guarded_m_s
+        before = waypoints[-2] if guarded and len(waypoints) > 1 else None
+        self._guarded_below_m = before.T_base_tcp[2, 3] if hasattr(before, "T_base_tcp") else -1.0
+        alone = guarded and before is None
+        self.leaves = self.contact_is_meant and not guarded
+        self.contact_is_meant = alone or self.leaves
+        self.label = "guarded motion" if alone else "blended motion"
         self._arm.start_path(waypoints)
+
+    def follow(self) -> None:
+        """Contact is meant no longer once a blended motion has left the line straight up."""
+        if self.label == "blended motion" and self._arm.state().T_base_tcp[2, 3] < self._guarded_below_m:
+            self.contact_is_meant, self.label = True, "guarded motion"
+        if self.label == "blended motion" and self.leaves:
+            away = float(np.hypot(*(self._arm.state().T_base_tcp[:2, 3] - self._from)))
+            self.leaves = self.contact_is_meant = away < LINE_M
 
 
 class Watcher:
@@ -158,6 +165,7 @@ class Watcher:
         simulation = self._world.simulation
         contacts = simulation.engine.getContactPoints(bodyA=simulation.robot, physicsClientId=simulation.client)
         touched = {(c[3], c[2], c[9] > TOUCH_N) for c in contacts if c[2] in simulation.bodies}
+        self._arm.follow()
         if self._arm.contact_is_meant:
             # What fingers touched in this part is what the action is for, or lies beside it.
             fresh = {body for link, body, _ in touched if self._is_finger(link)}
