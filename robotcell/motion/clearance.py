@@ -41,11 +41,13 @@ class Tool:
         load_m: how far a load reaches below the tcp; 0 without one.
         touch_m: height above the table [m] up to which things may be touched by fingers and load; None where nothing
             may be touched.
+        body_touch_m: likewise by the gripper's body: in a guarded motion among heaped blocks, which ends at a contact.
     """
 
     opening_m: float
     load_m: float = 0.0
     touch_m: float | None = None
+    body_touch_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ def check_clearance(path: Array, tool: Tool, seen: ClearanceMap, config: CellCon
     """Check that arm, gripper and load keep clear along a path.
 
     In free motion everything keeps `limits.clearance_m` and the map's error from every column. Where contact is meant
-    (`Tool.touch_m`), links and the gripper's body do so still, but fingers and load may touch what is not taller. Where
+    (`Tool.touch_m`, `Tool.body_touch_m`), links do so still, but gripper and load may touch what is not taller. Where
     a body stands nearer at the start already, it must not come nearer still.
 
     Args:
@@ -171,7 +173,7 @@ def _gaps(
         at = shape.points @ np.swapaxes(T_tcp[near, :3, :3], 1, 2) + T_tcp[near, None, :3, 3]
         groups = [(np.ones(len(shape.points), np.bool_), 0.0)]
         if tool.touch_m is not None:
-            groups = [(shape.body, 0.0), (~shape.body, tool.touch_m)]
+            groups = [(shape.body, tool.body_touch_m), (~shape.body, tool.touch_m)]
         for members, above in groups:
             points = at[:, members]
             gaps = seen.gaps(points.reshape(-1, 3), np.full(points[..., 0].size, shape.radius_m), above, margin)

@@ -20,7 +20,7 @@ from robotcell.geometry.rounded_path import round_corners
 from robotcell.geometry.transforms import Array, check_transform, interpolate_transforms, rotation_angle
 from robotcell.motion.clearance import Tool, check_clearance
 from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan, Shape, blended
-from robotcell.motion.tool import flange_pose
+from robotcell.motion.tool import HEAP_M, flange_pose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -195,7 +195,9 @@ def tools(plan: MotionPlan) -> list[Tool]:
         elif isinstance(step, JointMove):
             result.append(Tool(held if step.load_m > 0 else opening, step.load_m))
         elif isinstance(step, LinearMove):
-            result.append(Tool(held if step.load_m > 0 else opening, step.load_m, step.touch_m))
+            guarded = step.contact_force_n is not None and step.touch_m is not None
+            body_touch_m = HEAP_M if guarded else 0.0
+            result.append(Tool(held if step.load_m > 0 else opening, step.load_m, step.touch_m, body_touch_m))
         else:
             result.append(Tool(held))
     return result

@@ -144,9 +144,16 @@ def blended(steps: Sequence[Step]) -> tuple[tuple[int, ...], ...]:
     return tuple(groups)
 
 
-def without_blends(plan: MotionPlan) -> MotionPlan:
-    """The plan with a standstill at every target."""
-    steps = (replace(step, blend_m=0.0) if isinstance(step, JointMove | LinearMove) else step for step in plan.steps)
+def one_by_one(plan: MotionPlan) -> MotionPlan:
+    """The plan with a standstill at every target, and with fingers that are waited for: it takes the least room."""
+    steps: list[Step] = []
+    for step in plan.steps:
+        if isinstance(step, JointMove | LinearMove):
+            steps.append(replace(step, blend_m=0.0))
+        elif isinstance(step, Shape):
+            steps.append(Grip(step.label, step.width_m, step.force_n))
+        else:
+            steps.append(step)
     return replace(plan, steps=tuple(steps))
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TALLEST_OBJECT_M = TALLEST_BLOCK_M
 # Where contact is meant, fingers may touch what lies in a heap of blocks, or is not much taller than what is grasped:
 # the map of clearance rounds up.
-_HEAP_M, _TOUCH_MARGIN_M = 0.180, 0.020
+HEAP_M, _TOUCH_MARGIN_M = 0.180, 0.020
 # The gripper is taken to be this much larger all round, for what it comes down beside.
 _AROUND_M = 0.004
 # The unguarded part of a descent ends this far above the highest thing under the open gripper.
@@ -76,7 +76,7 @@ def tool_down_solutions(T_base_tcp: Array, config: CellConfig) -> list[Array]:
 
 def touch_height(top_m: float) -> float:
     """Height above the table [m] up to which things may be touched where something with that top is meant."""
-    return max(_HEAP_M, top_m + _TOUCH_MARGIN_M)
+    return max(HEAP_M, top_m + _TOUCH_MARGIN_M)
 
 
 def near_height(

@@ -24,7 +24,7 @@ from robotcell.geometry.transforms import make_transform, rotation_z
 from robotcell.motion.actions import above, plan_action
 from robotcell.motion.clearance import Obstructed, standing_clear
 from robotcell.motion.path_check import CheckedPlan, allowed_poses, check_path, check_step, tools
-from robotcell.motion.plan import JointMove, MotionPlan, without_blends
+from robotcell.motion.plan import JointMove, MotionPlan, one_by_one
 from robotcell.motion.tool import flange_pose, tool_down_solutions
 
 if TYPE_CHECKING:
@@ -79,8 +79,8 @@ def plan_way(
     except Obstructed as error:
         usual = error
     with suppress(UnsafeMotion):
-        # What stands beside a corner may be in the way of its rounding alone.
-        return check_path(without_blends(plan), config, seen)
+        # What stands beside a corner may be in the way of its rounding alone, or of fingers that are still wide open.
+        return check_path(one_by_one(plan), config, seen)
     searches = 0
     last, tool = [pair for pair in zip(plan.steps, tools(plan), strict=True) if isinstance(pair[0], JointMove)][-1]
     # Every plan ends at home or over the bin: where the arm may not stand there, none is looked for.
@@ -89,7 +89,7 @@ def plan_way(
         plans = []
         for q_high in (q_above, *_poses_above(q_above, config)):
             try:
-                plan = without_blends(plan_action(action, heightmap, q_start, config, q_high))
+                plan = one_by_one(plan_action(action, heightmap, q_start, config, q_high))
                 check_straight(plan, seen, config)
             except UnsafeMotion:
                 # From higher up the arm comes down to the same pose.
