@@ -76,5 +76,6 @@ class KeyboardHold:
                 self._may_go_on.clear()
                 self._say("hold after this action; Space goes on")
             else:
-                self._may_go_on.set()
+                # Said first: the job prints its own lines as soon as it goes on.
                 self._say("going on")
+                self._may_go_on.set()
