@@ -94,7 +94,7 @@ def again_and_again(do):
 def looking(camera):
     """A cell whose arm stands at home and whose camera this is."""
     config = load_config()
-    arm = SimpleNamespace(state=lambda: SimpleNamespace(q=np.array(config.motion.home_q)))
+    arm = SimpleNamespace(state=lambda: SimpleNamespace(q=np.array(config.motion.home_q), T_base_tcp=np.eye(4)))
     return Cell(config, Devices(arm, SimpleNamespace(), camera, WallClock()))
 
 

@@ -89,7 +89,7 @@ def test_joints_move_together_within_speed_and_acceleration() -> None:
     arm = Arm(START)
     goal = START + np.array([0.5, -0.2, 0.1, 0, 0, 0.3])
     path = run(arm, follow(arm, [joints(goal)]))
-    np.testing.assert_array_equal(path[-1], goal)
+    np.testing.assert_allclose(path[-1], goal, atol=1e-12)
     assert speeds(path).max() <= 1.0 + 1e-6
     acceleration = np.diff(path, n=2, axis=0) / PERIOD_S**2
     assert np.abs(acceleration).max() <= 2.0 + 1e-4
