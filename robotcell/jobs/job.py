@@ -333,9 +333,12 @@ class _Job:
 
     def _run(self, action_id: int, decision: Decision) -> tuple[View, Outcome, _Ahead | None]:
         cell, view = self.cell, decision.view
+        was_home = at_home(cell.arm.state(), cell.config)
         try:
             checked = self._plan(decision)
         except UnsafeMotion as error:
+            # Where the arm stood in the picture, it may have hidden what there is; now it stands at home.
+            view = view if was_home else self._look()
             return view, Outcome(Result.REFUSED, None, str(error), 0.0, float("nan")), None
         if self.confirm is not None and not self.confirm(decision, checked):
             return view, Outcome(Result.DECLINED, None, "somebody who was asked said no", 0.0, float("nan")), None

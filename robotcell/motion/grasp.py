@@ -10,6 +10,7 @@ import numpy as np
 
 from robotcell.config.fingers import closed_width, narrowest_hold
 from robotcell.geometry import rg2, ur5e
+from robotcell.geometry.transforms import rotation_angle
 from robotcell.motion.plan import (
     CheckHold,
     Grip,
@@ -183,9 +184,14 @@ def _over_bin(place: tuple[float, float, float], q_from: Array, config: CellConf
     # How an object lies in the bin does not matter; the jaw repeats itself after half a turn.
     poses = [tool_down(*place, rotation_angle_rad(k)) for k in range(ROTATIONS // 2)]
     turns = [solve_tool_down("carry to bin", T, config, q_from) for T in poses]
-    # Of equal ways, the one that ends nearest to home.
-    home = np.array(config.motion.home_q)
-    return min(turns, key=lambda q: (round(float(np.abs(q - q_from).max()), 2), float(np.abs(q - home).max())))
+    # Of equal ways, the one on which the load turns least: one that is held beside its middle slips as it is turned.
+    R_from = ur5e.forward(q_from)[:3, :3]
+
+    def cost(q: Array) -> tuple[float, float]:
+        turn = rotation_angle(R_from, ur5e.forward(q)[:3, :3])
+        return round(float(np.abs(q - q_from).max()), 2), turn
+
+    return min(turns, key=cost)
 
 
 def release_corners(config: CellConfig) -> tuple[tuple[float, float, float], ...]:

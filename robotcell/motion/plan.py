@@ -157,6 +157,25 @@ def one_by_one(plan: MotionPlan) -> MotionPlan:
     return replace(plan, steps=tuple(steps))
 
 
+def guarded_descents(plan: MotionPlan, config: CellConfig) -> MotionPlan:
+    """The plan with descents that are guarded, and slow, from their beginning; they may touch what they pass beside."""
+    steps = tuple(
+        guarded_move(step.label, step.T_base_tcp, config, step.touch_m)
+        if isinstance(step, LinearMove)
+        and step.touch_m is not None
+        and step.load_m == 0
+        and i + 1 < len(plan.steps)
+        and _is_guarded(plan.steps[i + 1])
+        else step
+        for i, step in enumerate(plan.steps)
+    )
+    return replace(plan, steps=steps)
+
+
+def _is_guarded(step: Step) -> bool:
+    return isinstance(step, LinearMove) and step.contact_force_n is not None
+
+
 def blend_radius(straight_m: float) -> float:
     """The blend radius [m] of a corner at one end of a straight motion of that length, whose other end is met."""
     return min(_BLEND_M, _BLEND_SHARE * max(straight_m, 0.0))

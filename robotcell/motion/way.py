@@ -24,7 +24,7 @@ from robotcell.geometry.transforms import make_transform, rotation_z
 from robotcell.motion.actions import above, plan_action
 from robotcell.motion.clearance import Obstructed, standing_clear
 from robotcell.motion.path_check import CheckedPlan, allowed_poses, check_path, check_step, tools
-from robotcell.motion.plan import JointMove, MotionPlan, one_by_one
+from robotcell.motion.plan import JointMove, MotionPlan, guarded_descents, one_by_one
 from robotcell.motion.tool import flange_pose, tool_down_solutions
 
 if TYPE_CHECKING:
@@ -81,6 +81,9 @@ def plan_way(
     with suppress(UnsafeMotion):
         # What stands beside a corner may be in the way of its rounding alone, or of fingers that are still wide open.
         return check_path(one_by_one(plan), config, seen)
+    with suppress(UnsafeMotion):
+        # The gripper's body comes down beside what is as high as a heap of blocks.
+        return check_path(guarded_descents(one_by_one(plan), config), config, seen)
     searches = 0
     last, tool = [pair for pair in zip(plan.steps, tools(plan), strict=True) if isinstance(pair[0], JointMove)][-1]
     # Every plan ends at home or over the bin: where the arm may not stand there, none is looked for.

@@ -237,9 +237,10 @@ def build_clearance_map(
         height[hidden] += _STEP_M
         looks = look(hidden)
         out = ~looks.within | looks.veiled | (height[hidden] >= camera_m)
-        open_top[hidden[out & surface[hidden]]] = True
+        # Where the picture ends below that height, the rest is taken for what stands beside the picture.
+        open_top[hidden[out & surface[hidden] & (height[hidden] >= TALLEST_BLOCK_M)]] = True
         left_hidden[hidden[out]] = True
-        ceiling[hidden] = np.where(looks.veiled, np.maximum(height[hidden], TALLEST_BLOCK_M), height[hidden])
+        ceiling[hidden] = np.where(out, np.maximum(height[hidden], TALLEST_BLOCK_M), height[hidden])
         surface[hidden[~out]] = looks.surface[~out]
         hidden = hidden[~out & ~looks.passed]
     top = open_top.reshape(shape)
