@@ -13,7 +13,7 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest
 
-# Every fault of a served arm, and a job over the wire, in real time: about two minutes.
+# Every fault of a served arm, and a job over the wire, in real time, and jobs that are killed and resumed: about five minutes.
 test-wire: setup
 	$(BIN)/python -m pytest -m wire
 

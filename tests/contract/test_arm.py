@@ -176,6 +176,16 @@ def test_a_path_passes_its_corners_in_order_without_a_halt_and_ends_at_rest(cell
     assert state.mode is ArmMode.READY
 
 
+def test_a_path_follows_a_path(cell: Cell, pace: float) -> None:
+    q = cell.arm.state().q
+    for shift in (0.1, 0.05, 0.0):
+        target = q + np.array((shift, 0, 0, 0, 0, 0))
+        between = JointWaypoint(target + np.array((0, 0.05, 0, 0, 0, 0)), 0.5 * pace, pace**2, 0.01)
+        cell.arm.start_path([between, JointWaypoint(target, 0.5 * pace, pace**2)])
+        finish(cell)
+        np.testing.assert_allclose(cell.arm.state().q, target, atol=2e-3)
+
+
 def test_a_stop_in_the_middle_of_a_corner_ends_a_path_there(cell: Cell, pace: float) -> None:
     path, corner = around_a_corner(cell, pace)
     cell.arm.start_path(path)

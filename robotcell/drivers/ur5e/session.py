@@ -44,6 +44,8 @@ _IDLE_WATCHDOG_HZ = 1.0
 _KICK_PERIOD_S = 0.02
 _PROGRAM_STARTS_S = 4.0
 _SETTING_APPLIES_S = 1.0
+# The number that our program reports before its first operation; each path sends the program anew.
+_NO_OPERATION = 0
 # A motion that was accepted begins within some milliseconds.
 _MOTION_BEGINS_S = 0.5
 _LAST_STOP_S = 0.6
@@ -216,14 +218,13 @@ class Session:
                 kind, position = PathEntry.eMoveType.MoveL, PathEntry.ePositionType.PositionTcpPose
                 numbers = [*leg.tcp_pose, leg.speed_m_s, leg.acceleration_m_s2, blend_m]
             path.addEntry(PathEntry(kind, position, numbers))
-        operation = self._control.getAsyncOperationProgressEx().operationId()
         taken = self._control.movePath(path, True)
         # The new program has no watchdog yet.
         self._watchdog_hz = 0.0
         if not taken or not self._set_watchdog(_MOVING_WATCHDOG_HZ):
             self._stop()
             return "the controller did not take the path"
-        self._begun(operation)
+        self._begun(_NO_OPERATION)
         return ""
 
     def _begun(self, operation: int) -> None:
