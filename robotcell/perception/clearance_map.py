@@ -240,7 +240,8 @@ def build_clearance_map(
         # Where the picture ends below that height, the rest is taken for what stands beside the picture.
         open_top[hidden[out & surface[hidden] & (height[hidden] >= TALLEST_BLOCK_M)]] = True
         left_hidden[hidden[out]] = True
-        ceiling[hidden] = np.where(out, np.maximum(height[hidden], TALLEST_BLOCK_M), height[hidden])
+        cut_off = looks.veiled | (out & surface[hidden])
+        ceiling[hidden] = np.where(cut_off, np.maximum(height[hidden], TALLEST_BLOCK_M), height[hidden])
         surface[hidden[~out]] = looks.surface[~out]
         hidden = hidden[~out & ~looks.passed]
     top = open_top.reshape(shape)
