@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotcell.motion.plan import JointMove, LinearMove
+from robotcell.motion.plan import JointMove, is_guarded
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from robotcell.geometry.transforms import Array
+    from robotcell.motion.plan import LinearMove
 
 # A straight motion is solved for joints by this program and by the controller, whose kinematics differ from the nominal
 # ones by up to a centimetre: a fifth of this at the arm's reach. A joint motion needs no solving.
@@ -72,10 +73,8 @@ def course_of(moves: Sequence[JointMove | LinearMove], path: Array, lowest_tip_m
     How a controller rounds a corner is its own affair, so blended motions are held to the wider bound.
     """
     last, load_m = moves[-1], max(move.load_m for move in moves)
-    if isinstance(last, LinearMove) and last.contact_force_n is not None:
-        phase = Phase.GUARDED
-    else:
-        phase = Phase.CARRY if load_m > 0 else Phase.FREE
+    not_guarded = Phase.CARRY if load_m > 0 else Phase.FREE
+    phase = Phase.GUARDED if is_guarded(last) else not_guarded
     off = _JOINTS_OFF_RAD if len(moves) == 1 and isinstance(last, JointMove) else _LINE_OFF_RAD
     return Course(last.label, phase, path, off, lowest_tip_m, load_m)
 

@@ -15,7 +15,7 @@ from robotcell.geometry.transforms import rotation_angle
 from robotcell.interfaces import JointWaypoint, LinearWaypoint
 from robotcell.motion.course import course_of, standing
 from robotcell.motion.guard import Guard, Latch
-from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, Shape, blended
+from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, Shape, blended, is_guarded
 from robotcell.motion.recorder import Recorder, StateLog
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from robotcell.geometry.transforms import Array
     from robotcell.interfaces import ArmState, Devices, Waypoint
     from robotcell.motion.path_check import CheckedPlan
-    from robotcell.motion.plan import Step
 
 # 125 Hz: the slower of the two rates at which UR controllers report.
 PERIOD_S = 0.008
@@ -139,12 +138,12 @@ class Executor:
         steps, lowest = checked.plan.steps, checked.lowest_tip_m
         peak_force, grip_force, width, held_m = 0.0, math.nan, math.nan, math.nan
         ending, label, shaping = Ending.DONE, "", False
-        touching = max((i for i, step in enumerate(steps) if isinstance(step, Grip) or not _free(step)), default=-1)
+        touching = max((i for i, step in enumerate(steps) if isinstance(step, Grip) or is_guarded(step)), default=-1)
         for group in blended(steps):
             step = steps[group[0]]
             label = step.label
             self._beside = beside if group[0] > touching else lambda: None
-            if shaping and (isinstance(step, Grip | CheckHold) or not _free(step)):
+            if shaping and (isinstance(step, Grip | CheckHold) or is_guarded(step)):
                 self._fingers_move(lowest)
                 shaping = False
             if isinstance(step, CheckHold):
@@ -358,11 +357,6 @@ class Executor:
                 arm.kick()
                 clock.sleep(PERIOD_S)
             self._log.add(arm.state(), self._width_m)
-
-
-def _free(step: Step) -> bool:
-    """Whether nothing may be touched during a motion; True for what is no motion."""
-    return not (isinstance(step, LinearMove) and step.contact_force_n is not None)
 
 
 def waypoint(move: JointMove | LinearMove, pace: float = 1.0) -> Waypoint:

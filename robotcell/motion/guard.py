@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import lru_cache
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -327,17 +328,12 @@ def _tcp(frames: Array) -> Array:
     return np.asarray(frames[6, :3, 3] + rg2.CLOSED_LENGTH_M * frames[6, :3, 2])
 
 
+@lru_cache(maxsize=32)
 def _tool_points(load_m: float) -> Array:
     """Points (N, 3) [m] of the flange that stand for the fingers, opened any way, and for a load below them."""
-    if load_m not in _TOOL_POINTS:
-        half = rg2.MAX_WIDTH_M / 2
-        x, z = np.linspace(-half, half, 5), np.linspace(rg2.PALM_M, rg2.CLOSED_LENGTH_M + load_m, 5)
-        grid = np.stack(np.meshgrid(x, [0.0], z, indexing="ij"), axis=-1)
-        _TOOL_POINTS[load_m] = grid.reshape(-1, 3)
-    return _TOOL_POINTS[load_m]
-
-
-_TOOL_POINTS: dict[float, Array] = {}
+    half = rg2.MAX_WIDTH_M / 2
+    x, z = np.linspace(-half, half, 5), np.linspace(rg2.PALM_M, rg2.CLOSED_LENGTH_M + load_m, 5)
+    return np.stack(np.meshgrid(x, [0.0], z, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _tripped(what: str) -> GuardTripped:

@@ -19,7 +19,7 @@ from robotcell.geometry import bodies, rg2, ur5e
 from robotcell.geometry.rounded_path import round_corners
 from robotcell.geometry.transforms import Array, check_transform, interpolate_transforms, rotation_angle
 from robotcell.motion.clearance import Tool, check_clearance
-from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan, Shape, blended
+from robotcell.motion.plan import CheckHold, Grip, JointMove, LinearMove, MotionPlan, Shape, blended, is_guarded
 from robotcell.motion.tool import HEAP_M, flange_pose
 
 if TYPE_CHECKING:
@@ -179,9 +179,7 @@ def tools(plan: MotionPlan) -> list[Tool]:
     opening = held = rg2.MAX_WIDTH_M
     shaped = math.nan
     for step in plan.steps:
-        if not math.isnan(shaped) and (
-            isinstance(step, Grip | CheckHold) or (isinstance(step, LinearMove) and step.contact_force_n is not None)
-        ):
+        if not math.isnan(shaped) and (isinstance(step, Grip | CheckHold) or is_guarded(step)):
             # The fingers are waited for.
             opening, shaped = shaped, math.nan
         if isinstance(step, Grip):
@@ -195,8 +193,7 @@ def tools(plan: MotionPlan) -> list[Tool]:
         elif isinstance(step, JointMove):
             result.append(Tool(held if step.load_m > 0 else opening, step.load_m))
         elif isinstance(step, LinearMove):
-            guarded = step.contact_force_n is not None and step.touch_m is not None
-            body_touch_m = HEAP_M if guarded else 0.0
+            body_touch_m = HEAP_M if is_guarded(step) and step.touch_m is not None else 0.0
             result.append(Tool(held if step.load_m > 0 else opening, step.load_m, step.touch_m, body_touch_m))
         else:
             result.append(Tool(held))

@@ -118,6 +118,11 @@ class MotionPlan:
     steps: tuple[Step, ...]
 
 
+def is_guarded(step: Step) -> bool:
+    """Whether a step is a motion that a contact ends."""
+    return isinstance(step, LinearMove) and step.contact_force_n is not None
+
+
 def blended(steps: Sequence[Step]) -> tuple[tuple[int, ...], ...]:
     """The numbers of the steps that are carried out as one.
 
@@ -129,7 +134,7 @@ def blended(steps: Sequence[Step]) -> tuple[tuple[int, ...], ...]:
     groups: list[tuple[int, ...]] = []
     group: list[int] = []
     for i, step in enumerate(steps):
-        free = isinstance(step, JointMove) or (isinstance(step, LinearMove) and step.contact_force_n is None)
+        free = isinstance(step, JointMove | LinearMove) and not is_guarded(step)
         if group and not (free or isinstance(step, CheckHold)):
             raise UnsafeMotion(f"step {steps[group[0]].label!r} cannot be blended with {step.label!r}: no free motion")
         group.append(i)
@@ -165,15 +170,11 @@ def guarded_descents(plan: MotionPlan, config: CellConfig) -> MotionPlan:
         and step.touch_m is not None
         and step.load_m == 0
         and i + 1 < len(plan.steps)
-        and _is_guarded(plan.steps[i + 1])
+        and is_guarded(plan.steps[i + 1])
         else step
         for i, step in enumerate(plan.steps)
     )
     return replace(plan, steps=steps)
-
-
-def _is_guarded(step: Step) -> bool:
-    return isinstance(step, LinearMove) and step.contact_force_n is not None
 
 
 def blend_radius(straight_m: float) -> float:
